@@ -14,7 +14,7 @@ from operator import attrgetter
 import numpy as np
 
 from slam_graph.arrays import IntArray
-from slam_graph.backend import Estimator, Innovations
+from slam_graph.backend import Estimator, Innovations, VelocityCorrection
 from slam_graph.config import RunConfig
 from slam_graph.errors import EstimationError
 from slam_graph.geometry import NavState
@@ -32,10 +32,12 @@ _BAD_SHARE = 0.9
 _MOST_UNFIT, _SOONER = 0.9, 5.0 / 6.0
 """Limit of the share of the tracks that do not fit the motion, and its interval, as a part of the
 other one. Most of the tracks may be on a wall that moves; nearly all do not fit a lost state."""
-_CORRECTED_S, _FEWEST_CORRECTIONS, _MOST_CORRECTED = 0.5, 5, 3.0
-"""Largest mean over so long, and over so many, of the squared corrections of the velocity, in units
-of the variances of the predictions. It is below one if covariances are right, up to 1.8 in good
-runs with a real IMU, and 4 to 20 where another velocity is taken over."""
+_CORRECTED_S, _FEWEST_CORRECTIONS = 0.5, 5
+"""Corrections of the velocity are summed over so long, and over so many."""
+_MOST_CORRECTED, _BEYOND_EXPECTED = 1.2, 8.0
+"""Largest mean of their squares, in variances of the prediction and in what is expected. The first
+is below one if covariances are right, and tells where images hardly do. Where tracks were broken,
+good runs have up to 0.8 and 2.8, and those that take another velocity over 1.9 and 19 or more."""
 _FOUND_AGAIN, _BROKEN_NS = 0.5, 1_500_000_000
 """Tracks are broken where fewer of them go on to the next frame; corrections count for so long."""
 _MOST_WAITING = 100
@@ -178,7 +180,7 @@ class Corrections:
     """
 
     def __init__(self) -> None:
-        self._recent: deque[tuple[int, float]] = deque()
+        self._recent: deque[tuple[int, VelocityCorrection]] = deque()
         self._ids: IntArray = np.zeros(0, np.int64)
         self._broken_ns: int | None = None
         self._agreed_ns: int | None = None
@@ -196,8 +198,8 @@ class Corrections:
             self._broken_ns = frame.stamp_ns
         self._ids = ids
 
-    def check(self, stamp_ns: int, correction: float) -> None:
-        """Add the correction of the next step, squared, in units of the variance.
+    def check(self, stamp_ns: int, correction: VelocityCorrection) -> None:
+        """Add the correction of the next step.
 
         After a pause, as at a standstill, earlier ones do not count.
 
@@ -212,9 +214,11 @@ class Corrections:
             recent.popleft()
         if len(recent) < _FEWEST_CORRECTIONS or recent[0][0] > begin_ns:
             return
-        mean = sum(square for _, square in recent) / len(recent)
+        squares = sum(correction.square for _, correction in recent)
+        expected = sum(correction.expected for _, correction in recent)
+        mean = squares / len(recent)
         broken = self._broken_ns is not None and stamp_ns <= self._broken_ns + _BROKEN_NS
-        if broken and mean > _MOST_CORRECTED:
+        if broken and mean > _MOST_CORRECTED and squares > _BEYOND_EXPECTED * expected:
             self._agreed_ns = recent[0][0]
             raise DivergenceError(
                 f"diverged at frame {stamp_ns}: no track went on, and new ones contradict the IMU: "

@@ -73,12 +73,31 @@ def imu_factor(
     return gtsam.CombinedImuFactor(X(i), V(i), X(j), V(j), B(i), B(j), pim)
 
 
-def _velocity_correction(predicted: NavState, state: NavState) -> float:
-    """Squared Mahalanobis distance of a velocity from the predicted one, over its dimension."""
-    assert predicted.covariance is not None
-    off = state.velocity - predicted.velocity
-    square = off @ np.linalg.solve(predicted.covariance[_VELOCITY, _VELOCITY], off)
-    return float(square) / len(off)
+@dataclass(frozen=True, slots=True)
+class VelocityCorrection:
+    """How far an estimate is from the velocity that the IMU predicted.
+
+    Both are in variances of the prediction, over the three axes.
+
+    Attributes:
+        square: squared Mahalanobis distance.
+        expected: its mean if covariances are right. A correction has the covariance P⁻ - P⁺, so
+            this is between 0, where images tell nothing, and 1, where they tell all.
+    """
+
+    square: float
+    expected: float
+
+    @staticmethod
+    def of(predicted: NavState, state: NavState) -> VelocityCorrection:
+        """Compare an estimate with its prediction; both have a covariance."""
+        assert predicted.covariance is not None
+        assert state.covariance is not None
+        prior, off = predicted.covariance[_VELOCITY, _VELOCITY], state.velocity - predicted.velocity
+        columns = np.column_stack([off, state.covariance[_VELOCITY, _VELOCITY]])
+        solved = np.linalg.solve(prior, columns)
+        expected = 1.0 - float(np.trace(solved[:, 1:])) / len(off)
+        return VelocityCorrection(float(off @ solved[:, 0]) / len(off), max(expected, 0.0))
 
 
 class Propagation:
@@ -195,21 +214,19 @@ class Propagation:
         """The state of the last frame with the covariance that vibration gives it."""
         return self._vibration.added_to(state)
 
-    def learn(self, state: NavState) -> float | None:
+    def learn(self, state: NavState) -> VelocityCorrection | None:
         """Adapt the noise of the IMU to the difference of an estimate from its prediction.
 
         Not at a standstill, whose zero velocity is no measurement of images.
 
         Returns:
-            Squared Mahalanobis distance of the velocity from its prediction, by the covariance of
-            the prediction, over its degrees of freedom; None where nothing was learned. Its mean is
-            below one if covariances are right: a correction is smaller than the error it corrects.
+            How the velocity was corrected; None where nothing was learned.
         """
         correction = None
         if self._last is not None and self._predicted is not None:
             if not self._still:
                 dt_s = (state.stamp_ns - self._last.stamp_ns) * 1e-9
-                correction = _velocity_correction(self._predicted, state)
+                correction = VelocityCorrection.of(self._predicted, state)
                 self.noise.learn(self._predicted, state, dt_s)
             if self._counts_vibration():
                 assert self._predicted.covariance is not None
