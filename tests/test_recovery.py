@@ -121,6 +121,18 @@ def test_a_jump_to_where_everything_fits_is_noticed_by_the_tracks_across_it() ->
     assert max(error_m(result, 0), error_m(result, 1)) < 0.02
 
 
+@pytest.mark.parametrize("algorithm", ["msckf", "okvis", "ekf", "fixed_lag_isam2"])
+def test_images_lead_through_a_time_without_imu(algorithm: str) -> None:
+    """What is known of biases stays known, so that no new start is needed."""
+    result = flown("imu_missing:at_s=6,duration_s=3", algorithm=algorithm)
+    assert [segment.ended_by for segment in result.segments] == [""]
+    assert error_m(result, 0) < 0.03
+    history = result.history
+    times_s = (history.trajectory().stamps_ns - result.input.start_ns) * 1e-9
+    after = int(np.argmin(np.abs(times_s - 9.2)))
+    assert np.all(history.sigmas()[after, 9:12] < 0.05), "m/s²"
+
+
 def test_a_correction_is_as_large_as_expected() -> None:
     """Over many draws, where an error of the covariance P⁻ is corrected to one of P⁺."""
     rng, prior = np.random.default_rng(1), np.eye(15)

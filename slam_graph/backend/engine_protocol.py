@@ -99,15 +99,18 @@ class EngineContext:
     def by_images(
         self, frame: FeatureFrame, known: Callable[[], tuple[IntArray, FloatArray]]
     ) -> Callable[[NavState, NavState], NavState] | None:
-        """What corrects the prediction of a frame by its images; None if an IMU predicts.
+        """What corrects the prediction of a frame by its images; None if that is not wanted.
 
         Args:
             frame: its features.
             known: gives ids (N,) and world positions (N, 3) of the features that are known.
         """
-        if self.rig.has_imu or not self.config.dynamics.start_at_images:
+        if not self.config.dynamics.start_at_images:
             return None
-        return lambda before, predicted: self._motion.corrected(before, predicted, frame, known())
+        last = self._motion.note(frame)
+        return lambda before, predicted: self._motion.corrected(
+            before, predicted, (last, frame), known()
+        )
 
     def add_observations(self, window: Window, frame: FeatureFrame) -> None:
         """Add the observations of the window's current frame to its tracks."""

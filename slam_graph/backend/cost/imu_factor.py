@@ -29,7 +29,7 @@ from slam_graph.geometry import NavState
 from slam_graph.sensors import ImuBuffer, ImuData, ImuNoise
 
 IMU_GAP_SCALE = 1000.0
-"""Factor on the noise densities between two frames where samples are missing: the IMU then hardly
+"""Factor on the white noise between two frames where samples are missing: the IMU then hardly
 counts."""
 
 _VELOCITY = slice(6, 9)
@@ -106,13 +106,21 @@ class Propagation:
     Attributes:
         noise: of the IMU; it adapts to the innovations where the settings ask for it.
         aiding: fixes and odometry between the frames; None for none.
+        guesses: whether the motion is a guess, without an IMU.
     """
 
-    def __init__(self, imu: ImuNoise, config: BackendConfig, diagnostics: Diagnostics) -> None:
+    def __init__(
+        self,
+        imu: ImuNoise,
+        config: BackendConfig,
+        diagnostics: Diagnostics,
+        guesses: bool = False,
+    ) -> None:
         self.config = config
         self.diagnostics = diagnostics
         self.noise = DynamicsNoise(imu, config.noise)
         self.aiding: Aiding | None = None
+        self.guesses = guesses
         self._density = config.noise.imu_scale * imu.accel_noise_density
         self.restart()
 
@@ -141,17 +149,21 @@ class Propagation:
             stamp_ns: time of the frame on the clock of the IMU.
             still: whether the platform has not moved.
             corrected: gives the state at which the new frame is linearised, from the last state and
-                the predicted one; this one if None.
+                the predicted one, where this is a guess or samples are missing. An estimate would
+                not find its way from there: the motion may be far from it.
         """
         i, j = window.frame, window.frame + 1
         previous = window.state.nav_state(i, window.stamp_ns, None)
         samples = imu.between(window.stamp_ns, stamp_ns)
         bias = window.state.frames.atConstantBias(B(i))
-        pim = samples.preintegrated(bias, self._params(imu, samples))
+        missing = self._misses_samples(imu, samples)
+        pim = samples.preintegrated(bias, self._params(samples, missing))
         self._samples = samples
         predicted = previous.predicted(pim, stamp_ns)
+        if not (missing or self.guesses):
+            corrected = None
         first = predicted if corrected is None else corrected(previous, predicted)
-        if corrected is not None and self.aiding is not None:
+        if self.guesses and corrected is not None and self.aiding is not None:
             first = self.aiding.by_odometry(previous, predicted) or first
         window.state.insert_imu_state(j, first)
         window.past.append(i)
@@ -200,7 +212,8 @@ class Propagation:
         """
         samples = imu.between(state.stamp_ns, stamp_ns)
         bias = gtsam.imuBias.ConstantBias(state.accel_bias, state.gyro_bias)
-        pim = samples.preintegrated(bias, self._params(imu, samples))
+        missing = self._misses_samples(imu, samples)
+        pim = samples.preintegrated(bias, self._params(samples, missing))
         predicted = state.predicted(pim, stamp_ns)
         if state.covariance is None:
             return predicted
@@ -235,11 +248,17 @@ class Propagation:
         self._last = state
         return correction
 
-    def _params(self, imu: ImuBuffer, samples: ImuData) -> gtsam.PreintegrationCombinedParams:
-        """Parameters of the preintegration; where samples are missing, with much larger noise."""
+    def _misses_samples(self, imu: ImuBuffer, samples: ImuData) -> bool:
+        """Whether there is a gap between samples from frame to frame; it is counted."""
         gap_s = imu.largest_gap_s(*samples.stamps_ns[[0, -1]].tolist())
-        change = MotionChange.between(self._samples, samples)
         if gap_s <= self.config.noise.max_imu_gap_s:
-            return self.noise.params(change=change)
+            return False
         self.diagnostics.warn("imu_gap_bridged", f"{gap_s:.3f} s without IMU samples")
-        return self.noise.params(IMU_GAP_SCALE, change=change)
+        return True
+
+    def _params(
+        self, samples: ImuData, missing: bool = False
+    ) -> gtsam.PreintegrationCombinedParams:
+        """Parameters of the preintegration; where samples are missing, with much larger noise."""
+        change = MotionChange.between(self._samples, samples)
+        return self.noise.params(IMU_GAP_SCALE if missing else 1.0, change=change)
