@@ -183,7 +183,7 @@ def test_corrections_of_the_velocity_count_where_tracks_are_broken(
             corrections.note(FeatureFrame(k * step_ns, (seen,)))
             if not 20 < k < 35:
                 square = 2.0 if k >= 40 else 20.0 * (k == 20)
-                corrections.check(k * step_ns, VelocityCorrection(square, expected))
+                corrections.check(k * step_ns, square, expected)
     agreed = corrections.agreed_until()
     assert (agreed is not None and 35 * step_ns <= agreed < 41 * step_ns) == noticed
     assert (len(corrections) > 0) == noticed
@@ -195,7 +195,7 @@ def test_a_single_correction_after_a_pause_is_no_contradiction() -> None:
         ids = np.arange(30) + (100 if k == 500 else 0)
         seen = FeatureObservations(ids, np.zeros((30, 2)), np.zeros((30, 2)))
         corrections.note(FeatureFrame(k * step_ns, (seen,)))
-        corrections.check(k * step_ns, VelocityCorrection(50.0 if k == 500 else 0.5, 0.5))
+        corrections.check(k * step_ns, 50.0 if k == 500 else 0.5, 0.5)
     assert corrections.agreed_until() is None
 
 

@@ -27,7 +27,6 @@ __all__ = [
     "RigProjection",
     "RobustLoss",
     "TenfoldDamping",
-    "VelocityCorrection",
     "WindowGraph",
     "levenberg_marquardt",
     "triangulate_frames",
@@ -37,7 +36,6 @@ __all__ = [
 if TYPE_CHECKING:
     from slam_graph.backend.backend_config import BackendConfig
     from slam_graph.backend.cost.gating import Innovations
-    from slam_graph.backend.cost.imu_factor import VelocityCorrection
     from slam_graph.backend.cost.reprojection import RigProjection
     from slam_graph.backend.cost.robust_loss import RobustLoss
     from slam_graph.backend.cost.selection_policies import (
@@ -70,7 +68,6 @@ else:
         {
             "backend_config": ("BackendConfig",),
             "cost.gating": ("Innovations",),
-            "cost.imu_factor": ("VelocityCorrection",),
             "cost.reprojection": ("RigProjection",),
             "cost.robust_loss": ("RobustLoss",),
             "cost.selection_policies": (

@@ -14,7 +14,7 @@ from operator import attrgetter
 import numpy as np
 
 from slam_graph.arrays import IntArray
-from slam_graph.backend import Estimator, Innovations, VelocityCorrection
+from slam_graph.backend import Estimator, Innovations
 from slam_graph.config import RunConfig
 from slam_graph.errors import EstimationError
 from slam_graph.geometry import NavState
@@ -180,7 +180,7 @@ class Corrections:
     """
 
     def __init__(self) -> None:
-        self._recent: deque[tuple[int, VelocityCorrection]] = deque()
+        self._recent: deque[tuple[int, float, float]] = deque()
         self._ids: IntArray = np.zeros(0, np.int64)
         self._broken_ns: int | None = None
         self._agreed_ns: int | None = None
@@ -198,10 +198,15 @@ class Corrections:
             self._broken_ns = frame.stamp_ns
         self._ids = ids
 
-    def check(self, stamp_ns: int, correction: VelocityCorrection) -> None:
+    def check(self, stamp_ns: int, square: float, expected: float) -> None:
         """Add the correction of the next step.
 
         After a pause, as at a standstill, earlier ones do not count.
+
+        Args:
+            stamp_ns: time of the frame.
+            square: of the correction, in variances of the prediction.
+            expected: its mean if covariances are right.
 
         Raises:
             DivergenceError: if velocities were corrected by too much.
@@ -209,16 +214,16 @@ class Corrections:
         recent, begin_ns = self._recent, stamp_ns - round(_CORRECTED_S * 1e9)
         if recent and recent[-1][0] < begin_ns:
             recent.clear()
-        recent.append((stamp_ns, correction))
+        recent.append((stamp_ns, square, expected))
         while len(recent) > _FEWEST_CORRECTIONS and recent[1][0] <= begin_ns:
             recent.popleft()
         if len(recent) < _FEWEST_CORRECTIONS or recent[0][0] > begin_ns:
             return
-        squares = sum(correction.square for _, correction in recent)
-        expected = sum(correction.expected for _, correction in recent)
+        squares = sum(square for _, square, _ in recent)
+        usual = sum(expected for _, _, expected in recent)
         mean = squares / len(recent)
         broken = self._broken_ns is not None and stamp_ns <= self._broken_ns + _BROKEN_NS
-        if broken and mean > _MOST_CORRECTED and squares > _BEYOND_EXPECTED * expected:
+        if broken and mean > _MOST_CORRECTED and squares > _BEYOND_EXPECTED * usual:
             self._agreed_ns = recent[0][0]
             raise DivergenceError(
                 f"diverged at frame {stamp_ns}: no track went on, and new ones contradict the IMU: "
@@ -280,7 +285,7 @@ class Agreement:
         correction = estimator.report.correction
         known = estimator.rig.has_imu and not estimator.start_is_doubtful
         if known and correction is not None:
-            self._velocity.check(frame.stamp_ns, correction)
+            self._velocity.check(frame.stamp_ns, correction.square, correction.expected)
 
     def check_motion(
         self, estimator: Estimator, frame: FeatureFrame, state: NavState | None
