@@ -37,7 +37,7 @@ _CORRECTED_S, _FEWEST_CORRECTIONS = 0.5, 5
 _MOST_CORRECTED, _BEYOND_EXPECTED = 1.2, 8.0
 """Largest mean of their squares, in variances of the prediction and in what is expected. The first
 is below one if covariances are right, and tells where images hardly do. Where tracks were broken,
-good runs have up to 0.8 and 2.8, and those that take another velocity over 1.9 and 19 or more."""
+good runs have up to 0.8 and 5, and those that take another velocity over 1.9 and 19 or more."""
 _FOUND_AGAIN, _BROKEN_NS = 0.5, 1_500_000_000
 """Tracks are broken where fewer of them go on to the next frame; corrections count for so long."""
 _MOST_WAITING = 100
