@@ -13,13 +13,15 @@ import pytest
 from typer.testing import CliRunner
 
 import slam_graph as sg
-from slam_graph.arrays import FloatArray
+from slam_graph.arrays import BoolArray, FloatArray, IntArray
 from slam_graph.cli.main import app
 from slam_graph.datasets.calibration.kalibr_calibration import write_kalibr
 from slam_graph.datasets.faults.injection import inject
 from slam_graph.datasets.memory_sequence import dataset_from_arrays
 from slam_graph.datasets.sequence import RecordedSequence
 from slam_graph.diagnosis import Diagnosis
+from slam_graph.diagnosis.finding import Finding
+from slam_graph.diagnosis.gathering import Part, uninterrupted
 from slam_graph.sensors.measurements import FeatureFrame, ImuData
 from slam_graph.sensors.rig import Rig, RigCamera
 
@@ -237,6 +239,69 @@ def test_shutter_that_rolls() -> None:
     still = changed(recorded[0], lambda c: replace(c, readout_s=0.0, rolling_shutter=False))
     values = first(judged(recorded, still), "rolling_shutter")
     assert values["readout_s"] == pytest.approx(0.03, abs=0.005)
+
+
+def jumping(part: Recorded, other: Recorded, between: tuple[int, int]) -> Recorded:
+    """A recording with that of another flight inside of a time."""
+
+    def inside(stamps_ns: IntArray) -> BoolArray:
+        return (between[0] < stamps_ns) & (stamps_ns < between[1])
+
+    rig, frames, imu = part
+    moved = {frame.stamp_ns: frame for frame in other[1]}
+    frames = [moved[f.stamp_ns] if inside(np.array(f.stamp_ns)) else f for f in frames]
+    rows = inside(imu.stamps_ns)[:, None]
+    samples = np.where(rows, other[2].gyro, imu.gyro), np.where(rows, other[2].accel, imu.accel)
+    return rig, frames, ImuData(imu.stamps_ns, *samples)
+
+
+@pytest.mark.parametrize("look", [Diagnosis.of_tracks, Diagnosis.nearby])
+def test_what_was_lost_does_not_count(
+    stereo_tracks: Recorded, look: Callable[..., Diagnosis]
+) -> None:
+    """Whatever happens while an estimate is lost, the comparisons say the same."""
+    second = 1_000_000_000
+    begin, end = (stereo_tracks[1][0].stamp_ns + s * second for s in (6, 8))
+    margin = round(0.35 * second)  # of the samples around frames
+    other = taken(sg.simulate(trajectory="random", duration_s=14, seed=5))
+    jumped = jumping(stereo_tracks, other, (begin + margin, end - margin))
+    assert not np.array_equal(jumped[2].gyro, stereo_tracks[2].gyro)
+
+    def compared(recorded: Recorded) -> list[Finding]:
+        kinds = ("camera_and_gyroscope", "scale")  # others are of the IMU as a whole
+        found = look(*recorded, lost=[(begin, end)])
+        assert not found.faults, found.best_guess()
+        return [finding for finding in found.findings if finding.kind in kinds]
+
+    assert compared(jumped) == compared(stereo_tracks)
+    assert len(compared(jumped)) == 2
+
+
+def test_a_jump_that_nobody_noticed_does_not_turn_axes() -> None:
+    """It spoils one of two windows, and wrong axes spoil every window."""
+    flight = sg.simulate(trajectory="random", duration_s=16, seed=20)
+    diagnosis = judged(taken(inject(flight, ["kidnapped:at_s=6,duration_s=3.7"])))
+    assert not diagnosis.faults, diagnosis.best_guess()
+
+
+def test_pieces_have_no_gaps(real_tracks: Recorded) -> None:
+    """Neither of frames nor of samples, and each piece has its own samples around its frames."""
+    _, frames, imu = real_tracks
+    first_ns = frames[0].stamp_ns
+    at = [first_ns + round(s * 1e9) for s in (3.0, 4.0, 7.0, 7.5, 10.0, 11.5)]
+    seen = [f for f in frames if not at[0] < f.stamp_ns < at[1]]
+    rows = (imu.stamps_ns < at[2]) | (imu.stamps_ns > at[3])
+    part = Part(seen, ImuData(imu.stamps_ns[rows], imu.gyro[rows], imu.accel[rows]))
+    pieces = uninterrupted(part, [(at[4], at[5])])
+    assert len(pieces) == 4
+    kept = [frame for piece in pieces for frame in piece.frames]
+    assert kept == [f for f in seen if not at[4] < f.stamp_ns < at[5]]
+    for piece in pieces:
+        stamps = np.array([frame.stamp_ns for frame in piece.frames])
+        assert max(np.diff(stamps).max() / 5e8, np.diff(piece.imu.stamps_ns).max() / 2e8) <= 1.0
+        assert stamps[0] - piece.imu.stamps_ns[0] <= 3e8
+        assert piece.imu.stamps_ns[-1] - stamps[-1] <= 3e8
+    assert uninterrupted(Part([], imu)) == []
 
 
 def test_clocks_that_do_not_belong_together(real_tracks: Recorded) -> None:

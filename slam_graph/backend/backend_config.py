@@ -247,7 +247,8 @@ class DynamicsConfig(Settings):
     min_points: int = expert(10, ge=4)
     """Fewest points of a known depth that tell the motion between two images."""
     start_at_images: bool = expert(default=True)
-    """Whether `constant_velocity` begins the steps of a frame at the pose that its images show."""
+    """Whether `constant_velocity`, and an IMU of which samples are missing, begin the steps of a
+    frame at the pose that its images show."""
 
     def uses_imu(self, has_imu: bool) -> bool:
         """Whether an IMU predicts the states, of a rig that has one or not.

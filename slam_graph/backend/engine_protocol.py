@@ -21,7 +21,7 @@ import numpy as np
 from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.backend.backend_config import BackendConfig
 from slam_graph.backend.cost.gating import Innovations
-from slam_graph.backend.cost.imu_factor import Propagation
+from slam_graph.backend.cost.imu_factor import Propagation, VelocityCorrection
 from slam_graph.backend.cost.pixel_noise import PixelNoise
 from slam_graph.backend.cost.reprojection import RigProjection
 from slam_graph.backend.online_calibration import CalibrationVariables
@@ -44,8 +44,7 @@ class StepReport:
         costs: the cost before the first Gauss-Newton step and after each; empty if not known.
         columns: dimension of the state, with the features that are stored; 0 without costs.
         innovations: how far the measurements were from what was predicted.
-        correction: of the velocity that the IMU predicted, squared, in units of the variance of the
-            prediction; None if not known, and at a standstill.
+        correction: of the velocity that the IMU predicted; None if not known, and at a standstill.
         rejected: ids (N,) of the features that the gate rejected, ascending.
     """
 
@@ -53,7 +52,7 @@ class StepReport:
     costs: tuple[float, ...] = ()
     columns: int = 0
     innovations: Innovations = field(default_factory=Innovations)
-    correction: float | None = None
+    correction: VelocityCorrection | None = None
     rejected: IntArray = field(default_factory=lambda: np.zeros(0, np.int64))
 
     @contextmanager
@@ -100,15 +99,18 @@ class EngineContext:
     def by_images(
         self, frame: FeatureFrame, known: Callable[[], tuple[IntArray, FloatArray]]
     ) -> Callable[[NavState, NavState], NavState] | None:
-        """What corrects the prediction of a frame by its images; None if an IMU predicts.
+        """What corrects the prediction of a frame by its images; None if that is not wanted.
 
         Args:
             frame: its features.
             known: gives ids (N,) and world positions (N, 3) of the features that are known.
         """
-        if self.rig.has_imu or not self.config.dynamics.start_at_images:
+        if not self.config.dynamics.start_at_images:
             return None
-        return lambda before, predicted: self._motion.corrected(before, predicted, frame, known())
+        last = self._motion.note(frame)
+        return lambda before, predicted: self._motion.corrected(
+            before, predicted, (last, frame), known()
+        )
 
     def add_observations(self, window: Window, frame: FeatureFrame) -> None:
         """Add the observations of the window's current frame to its tracks."""

@@ -114,7 +114,7 @@ class Estimator(EstimatorKnowledge):
         rig, config, diagnostics = self.rig, self.config, self.diagnostics
         calibration = CalibrationVariables(rig, self._variables)
         projection = CalibratedProjection(calibration) if calibration.keys else RigProjection(rig)
-        propagation = Propagation(rig.imu, config, diagnostics)
+        propagation = Propagation(rig.imu, config, diagnostics, guesses=not rig.has_imu)
         context = EngineContext(
             rig, self.algorithm, config, diagnostics, calibration, projection, propagation, imu
         )

@@ -2,6 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The motion from frame to frame by the images alone, where no IMU predicts it.
 
+That is without an IMU, and where samples of it are missing.
+
 A body that turns to and fro at 150°/s is after one frame where constant velocity does not expect
 it, and one Gauss-Newton step from there ends beside the minimum. So the new pose is first found by
 PnP from points that are known already: features of the estimator, and those whose depth the last
@@ -25,6 +27,8 @@ from slam_graph.sensors import FeatureFrame, Rig, RigCamera
 
 ERROR_PX = 4.0
 """Largest error of a point that fits the motion."""
+_SAME_NS = 5_000_000
+"""The time from frame to frame is that from state to state, to so much."""
 _LEAST_SHARE = 0.5
 """Part of the known points that must fit it."""
 _ROUNDS = 3
@@ -44,38 +48,51 @@ class VisualMotion:
         self._min_points = min_points
         self._last: FeatureFrame | None = None
 
+    def note(self, frame: FeatureFrame) -> FeatureFrame | None:
+        """Note the next frame; the one before it."""
+        last, self._last = self._last, frame
+        return last
+
     def corrected(
         self,
         before: NavState,
         predicted: NavState,
-        frame: FeatureFrame,
+        frames: tuple[FeatureFrame | None, FeatureFrame],
         known: tuple[IntArray, FloatArray],
     ) -> NavState:
         """The predicted state with the pose, velocity and rate that the images show.
 
         Args:
             before: state at the last frame.
-            predicted: state at the new one, by constant velocity.
-            frame: its features.
+            predicted: state at the new one, by constant velocity, or by an IMU of which samples are
+                missing.
+            frames: features of the last frame, if there was one, and of the new one.
             known: ids (N,) and world positions (N, 3) of features that the estimator knows.
         """
-        ids, points = self._known(before, known)
-        self._last = frame
+        last, frame = frames
+        since_ns = predicted.stamp_ns - before.stamp_ns
+        if last is not None and abs(frame.stamp_ns - last.stamp_ns - since_ns) > _SAME_NS:
+            last = None  # it is not that of the state before
+        ids, points = self._known(before, last, known)
         found = predicted
         for _ in range(_ROUNDS if self._rig.rolling else 1):
-            pose = self._pose(frame, ids, points, -found.gyro_bias)
+            pose = self._pose(frame, ids, points, self._rate(found))
             if pose is None:
                 return predicted
-            found = moved_to(before, predicted, pose)
+            found = moved_to(before, predicted, pose, self._rig.has_imu)
         return found
 
+    def _rate(self, state: NavState) -> FloatArray:
+        """Angular rate (3,) of the body, rad/s: without an IMU that is the bias, negative."""
+        return np.zeros(3) if self._rig.has_imu else -state.gyro_bias
+
     def _known(
-        self, before: NavState, known: tuple[IntArray, FloatArray]
+        self, before: NavState, last: FeatureFrame | None, known: tuple[IntArray, FloatArray]
     ) -> tuple[IntArray, FloatArray]:
         """Known features, ascending ids, and those of the last frame with a depth."""
         ids, points = known
-        if self._last is not None:
-            seen, local = depths_within(self._last, self._rig, -before.gyro_bias)
+        if last is not None:
+            seen, local = depths_within(last, self._rig, self._rate(before))
             others = ~np.isin(seen, ids)
             world = np.asarray(before.world_T_body.transformFrom(local[others].T)).T
             ids = np.concatenate([ids, seen[others]])
@@ -141,8 +158,12 @@ def depths_within(
     return ids, points
 
 
-def moved_to(before: NavState, predicted: NavState, pose: gtsam.Pose3) -> NavState:
+def moved_to(
+    before: NavState, predicted: NavState, pose: gtsam.Pose3, with_imu: bool = False
+) -> NavState:
     """A predicted state at another pose, with the mean velocity and rate that lead there.
+
+    With an IMU its bias says nothing of the rate, and stays.
 
     White noise would let both change by half as much again; but with a rolling shutter the rate
     moves the rows, and so the pose that PnP finds: the two then overshoot in turn.
@@ -155,5 +176,5 @@ def moved_to(before: NavState, predicted: NavState, pose: gtsam.Pose3) -> NavSta
         predicted,
         world_T_body=pose,
         velocity=predicted.velocity + shift / seconds,
-        gyro_bias=predicted.gyro_bias - turn / seconds,
+        gyro_bias=predicted.gyro_bias - (0.0 if with_imu else 1.0) * turn / seconds,
     )

@@ -9,12 +9,12 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 
-from slam_graph.arrays import FloatArray, IntArray
+from slam_graph.arrays import FloatArray
 from slam_graph.datasets import RecordedSequence
 from slam_graph.diagnosis.camera_and_gyroscope import compare, refine
 from slam_graph.diagnosis.finding import Finding, in_order
 from slam_graph.diagnosis.frame_checks import check_images, check_stamps, check_tracks
-from slam_graph.diagnosis.gathering import Material, Part, around, gather
+from slam_graph.diagnosis.gathering import Material, Part, around, gather, uninterrupted
 from slam_graph.diagnosis.imu_checks import check_sampling, check_units
 from slam_graph.diagnosis.motion_checks import check_motion
 from slam_graph.diagnosis.run_evidence import Evidence
@@ -40,8 +40,6 @@ SETUP_KINDS = (
 """Findings about what a run was given: calibration, units and clocks."""
 _SURE_WARNINGS = ("baseline", "stereo_geometry")
 """Those that count where they are warnings too; all others where they are errors."""
-_PAUSE_NS, _GAP_NS = 500_000_000, 200_000_000
-"""Times without frames, and without samples, that end a part of what is in memory."""
 _FEWEST_SAMPLES, _FEWEST_FRAMES = 50, 10
 """Samples and frames that a comparison needs at least."""
 
@@ -80,6 +78,7 @@ class Diagnosis:
         frames: Sequence[FeatureFrame],
         imu: ImuData,
         pairs: Sequence[CameraFrame] = (),
+        lost: Sequence[tuple[int, int]] = (),
     ) -> Diagnosis:
         """The same from features and samples in memory, such as those of a run that failed.
 
@@ -89,8 +88,11 @@ class Diagnosis:
             imu: samples over them, as they were recorded.
             pairs: images of the first two cameras now and then, if there are any: features were
                 matched under the calibration that is to be judged, and fail where it is far off.
+            lost: times in which the estimate of a run was lost, from its last good state to where
+                that was noticed, ns. The platform may have been put somewhere else meanwhile, so
+                nothing is compared across them, if enough is left.
         """
-        material = _remembered(rig, frames, imu)
+        material = _remembered(rig, frames, imu, lost)
         for pair in pairs:
             first, second = pair.images[:2]
             if first is not None and second is not None:
@@ -98,13 +100,18 @@ class Diagnosis:
         return Diagnosis(in_order(_judged(material)))
 
     @staticmethod
-    def nearby(rig: Rig, frames: Sequence[FeatureFrame], imu: ImuData) -> Diagnosis:
+    def nearby(
+        rig: Rig,
+        frames: Sequence[FeatureFrame],
+        imu: ImuData,
+        lost: Sequence[tuple[int, int]] = (),
+    ) -> Diagnosis:
         """A quick look, in a tenth of the time, where the calibration is right or nearly so.
 
         Units and axes of gyroscope and accelerometer are those with which an estimate came to its
         end, so that nothing else is tried. Arguments are those of `of_tracks`.
         """
-        material = _remembered(rig, frames, imu)
+        material = _remembered(rig, frames, imu, lost)
         found, factor = check_units(imu)
         parts = _enough(material, factor)
         if not parts:
@@ -199,47 +206,44 @@ def _judged(material: Material) -> list[Finding]:
     return found
 
 
-def _remembered(rig: Rig, frames: Sequence[FeatureFrame], imu: ImuData) -> Material:
+def _remembered(
+    rig: Rig, frames: Sequence[FeatureFrame], imu: ImuData, lost: Sequence[tuple[int, int]]
+) -> Material:
     """Features and samples in memory, in parts without interruption."""
     frames = [frame.usable(len(rig.cameras))[0] for frame in frames]
-    material = Material(rig, imu, [])
+    material = Material(rig, imu, [], lost=lost)
     if frames:
-        imu = around(imu, frames[0].stamp_ns, frames[-1].stamp_ns)
-        stamps = np.array([frame.stamp_ns for frame in frames], np.int64)
-        begins = np.sort(
-            np.concatenate([_after_gaps(stamps, _PAUSE_NS), _after_gaps(imu.stamps_ns, _GAP_NS)])
-        )
-        of_frame = np.searchsorted(begins, stamps, side="right")
-        of_sample = np.searchsorted(begins, imu.stamps_ns, side="right")
-        for k in np.unique(of_frame):
-            part = [frame for frame, of in zip(frames, of_frame, strict=True) if of == k]
-            rows = of_sample == k
-            samples = ImuData(imu.stamps_ns[rows], imu.gyro[rows], imu.accel[rows])
-            material.parts.append(Part(part, samples))
+        whole = Part(frames, around(imu, frames[0].stamp_ns, frames[-1].stamp_ns))
+        material.parts = uninterrupted(whole)
         if len(rig.cameras) > 1:
             step = max(1, len(frames) // 8)
             material.stereo = [StereoMatches.of_tracks(f) for f in frames[::step]]
     return material
 
 
-def _after_gaps(stamps_ns: IntArray, longest_ns: int) -> IntArray:
-    """The stamps before which nothing was recorded for too long."""
-    after: IntArray = stamps_ns[1:][np.diff(stamps_ns) > longest_ns]
-    return after
-
-
 def _enough(material: Material, factor: float) -> list[Part]:
-    """Parts that can be compared, with forces in m/s²."""
+    """Pieces without interruption that can be compared, with forces in m/s²."""
     parts = [_in_si(part, factor) for part in material.parts]
-    return [p for p in parts if len(p.imu) >= _FEWEST_SAMPLES and len(p.frames) > _FEWEST_FRAMES]
+
+    def enough(lost: Sequence[tuple[int, int]]) -> list[Part]:
+        pieces = [_covered(piece) for part in parts for piece in uninterrupted(part, lost)]
+        return [
+            p for p in pieces if len(p.imu) >= _FEWEST_SAMPLES and len(p.frames) > _FEWEST_FRAMES
+        ]
+
+    return enough(material.lost) or enough(())
 
 
 def _in_si(part: Part, factor: float) -> Part:
-    """A part with forces in m/s², samples that are finite, and the frames that they cover."""
+    """A part with forces in m/s², and the samples that are finite."""
     imu = part.imu
     good = np.isfinite(imu.gyro).all(axis=1) & np.isfinite(imu.accel).all(axis=1)
-    imu = ImuData(imu.stamps_ns[good], imu.gyro[good], factor * imu.accel[good])
-    if not len(imu):
-        return Part([], imu)
-    first_ns, last_ns = imu.stamps_ns[0], imu.stamps_ns[-1]
-    return Part([f for f in part.frames if first_ns <= f.stamp_ns <= last_ns], imu)
+    return Part(part.frames, ImuData(imu.stamps_ns[good], imu.gyro[good], factor * imu.accel[good]))
+
+
+def _covered(part: Part) -> Part:
+    """A part with the frames that its samples cover."""
+    stamps = part.imu.stamps_ns
+    if not len(stamps):
+        return Part([], part.imu)
+    return Part([f for f in part.frames if stamps[0] <= f.stamp_ns <= stamps[-1]], part.imu)

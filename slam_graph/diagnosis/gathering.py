@@ -8,7 +8,7 @@ platform turns most, because rotation shows clocks, mounting and focal length.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -30,6 +30,9 @@ _STEREO_EVERY_S = 2.5
 _MARGIN_NS = 300_000_000
 """IMU samples around a part that are kept with it: more than a time offset."""
 
+_PAUSE_NS, _GAP_NS = 500_000_000, 200_000_000
+"""Nothing is compared across longer times without frames, and without samples."""
+
 _MATCHED_FRAMES = 3
 """The second camera is looked at in every third frame."""
 
@@ -39,7 +42,7 @@ _TRACKING = FrontendConfig(prediction="flow", max_features=150)
 
 @dataclass(frozen=True, eq=False)
 class Part:
-    """A part of a recording without interruption.
+    """A part of a recording.
 
     Attributes:
         frames: features of its frames.
@@ -61,6 +64,8 @@ class Material:
         stereo: matches of the first two cameras, found without their calibration.
         images: their quality; None for tracks.
         faults: what the reader counted, by kind.
+        lost: times in which an estimate was lost, from the last good state to where that was
+            noticed, ns.
     """
 
     rig: Rig
@@ -69,6 +74,7 @@ class Material:
     stereo: list[StereoMatches] = field(default_factory=list)
     images: ImageSurvey | None = None
     faults: dict[str, int] = field(default_factory=dict)
+    lost: Sequence[tuple[int, int]] = ()
 
     @property
     def stamps_ns(self) -> list[IntArray]:
@@ -101,6 +107,34 @@ def around(imu: ImuData, start_ns: int, end_ns: int) -> ImuData:
     """The samples from a little before the start to a little after the end."""
     rows = np.searchsorted(imu.stamps_ns, [start_ns - _MARGIN_NS, end_ns + _MARGIN_NS])
     return imu[rows[0] : rows[1]]
+
+
+def uninterrupted(part: Part, lost: Sequence[tuple[int, int]] = ()) -> list[Part]:
+    """The pieces of a part between its gaps, without what is inside of the times that were lost.
+
+    In these the platform may have been put somewhere else, which no sensor measures.
+
+    Args:
+        part: with frames.
+        lost: beginnings and ends of such times, ns, in their order.
+    """
+    frames, samples = part.frames, part.imu.stamps_ns
+    frames = [f for f in frames if not any(begin < f.stamp_ns < end for begin, end in lost)]
+    stamps = np.array([frame.stamp_ns for frame in frames], np.int64)
+    begins = samples[1:][np.diff(samples) > _GAP_NS]
+    stretch = np.searchsorted(begins, stamps, side="right")
+    ends = np.array([end for _, end in lost], np.int64)
+    piece = stretch + np.searchsorted(ends, stamps, side="right")
+    piece[1:] += np.cumsum(np.diff(stamps) > _PAUSE_NS)
+    of_sample = np.searchsorted(begins, samples, side="right")
+    pieces = []
+    for k in np.unique(piece):
+        rows = np.flatnonzero(piece == k)
+        inside = of_sample == stretch[rows[0]]
+        imu = ImuData(samples[inside], part.imu.gyro[inside], part.imu.accel[inside])
+        imu = around(imu, int(stamps[rows[0]]), int(stamps[rows[-1]]))
+        pieces.append(Part([frames[row] for row in rows], imu))
+    return pieces
 
 
 def chosen_parts(start_ns: int, end_ns: int, imu: ImuData) -> list[tuple[int, int]]:

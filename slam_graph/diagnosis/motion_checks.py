@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from statistics import median_low
 
 import numpy as np
 
@@ -118,7 +119,7 @@ def _axes(windows: list[Window]) -> tuple[FloatArray, list[Finding]]:
     k = min(best, key=lambda k: _score_of(solved[k]))
     P, score, usual = candidates[k], _score_of(solved[k]), _score_of(nominal)
     # wrong axes spoil every window; a single one may end in a wrong minimum under right ones
-    better = np.median(_sizes_px(nominal) / _sizes_px(solved[k]))
+    better = median_low((_sizes_px(nominal) / _sizes_px(solved[k])).tolist())
     unclear = min(better, usual / score) < _CLEARER or score > _FITS_PX
     if np.allclose(P, np.eye(3)) or unclear:
         return np.eye(3), []

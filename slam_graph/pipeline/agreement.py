@@ -32,10 +32,12 @@ _BAD_SHARE = 0.9
 _MOST_UNFIT, _SOONER = 0.9, 5.0 / 6.0
 """Limit of the share of the tracks that do not fit the motion, and its interval, as a part of the
 other one. Most of the tracks may be on a wall that moves; nearly all do not fit a lost state."""
-_CORRECTED_S, _FEWEST_CORRECTIONS, _MOST_CORRECTED = 0.5, 5, 3.0
-"""Largest mean over so long, and over so many, of the squared corrections of the velocity, in units
-of the variances of the predictions. It is below one if covariances are right, up to 1.8 in good
-runs with a real IMU, and 4 to 20 where another velocity is taken over."""
+_CORRECTED_S, _FEWEST_CORRECTIONS = 0.5, 5
+"""Corrections of the velocity are summed over so long, and over so many."""
+_MOST_CORRECTED, _BEYOND_EXPECTED = 1.2, 8.0
+"""Largest mean of their squares, in variances of the prediction and in what is expected. The first
+is below one if covariances are right, and tells where images hardly do. Where tracks were broken,
+good runs have up to 0.8 and 5, and those that take another velocity over 1.9 and 19 or more."""
 _FOUND_AGAIN, _BROKEN_NS = 0.5, 1_500_000_000
 """Tracks are broken where fewer of them go on to the next frame; corrections count for so long."""
 _MOST_WAITING = 100
@@ -178,7 +180,7 @@ class Corrections:
     """
 
     def __init__(self) -> None:
-        self._recent: deque[tuple[int, float]] = deque()
+        self._recent: deque[tuple[int, float, float]] = deque()
         self._ids: IntArray = np.zeros(0, np.int64)
         self._broken_ns: int | None = None
         self._agreed_ns: int | None = None
@@ -196,10 +198,15 @@ class Corrections:
             self._broken_ns = frame.stamp_ns
         self._ids = ids
 
-    def check(self, stamp_ns: int, correction: float) -> None:
-        """Add the correction of the next step, squared, in units of the variance.
+    def check(self, stamp_ns: int, square: float, expected: float) -> None:
+        """Add the correction of the next step.
 
         After a pause, as at a standstill, earlier ones do not count.
+
+        Args:
+            stamp_ns: time of the frame.
+            square: of the correction, in variances of the prediction.
+            expected: its mean if covariances are right.
 
         Raises:
             DivergenceError: if velocities were corrected by too much.
@@ -207,14 +214,16 @@ class Corrections:
         recent, begin_ns = self._recent, stamp_ns - round(_CORRECTED_S * 1e9)
         if recent and recent[-1][0] < begin_ns:
             recent.clear()
-        recent.append((stamp_ns, correction))
+        recent.append((stamp_ns, square, expected))
         while len(recent) > _FEWEST_CORRECTIONS and recent[1][0] <= begin_ns:
             recent.popleft()
         if len(recent) < _FEWEST_CORRECTIONS or recent[0][0] > begin_ns:
             return
-        mean = sum(square for _, square in recent) / len(recent)
+        squares = sum(square for _, square, _ in recent)
+        usual = sum(expected for _, _, expected in recent)
+        mean = squares / len(recent)
         broken = self._broken_ns is not None and stamp_ns <= self._broken_ns + _BROKEN_NS
-        if broken and mean > _MOST_CORRECTED:
+        if broken and mean > _MOST_CORRECTED and squares > _BEYOND_EXPECTED * usual:
             self._agreed_ns = recent[0][0]
             raise DivergenceError(
                 f"diverged at frame {stamp_ns}: no track went on, and new ones contradict the IMU: "
@@ -276,7 +285,7 @@ class Agreement:
         correction = estimator.report.correction
         known = estimator.rig.has_imu and not estimator.start_is_doubtful
         if known and correction is not None:
-            self._velocity.check(frame.stamp_ns, correction)
+            self._velocity.check(frame.stamp_ns, correction.square, correction.expected)
 
     def check_motion(
         self, estimator: Estimator, frame: FeatureFrame, state: NavState | None

@@ -124,6 +124,7 @@ class Verdict(Stage):
         self._result, self._diagnostics = result, diagnostics
         self._kept = _Memory(len(result.input.rig.cameras) > 1, objects or NoObjects())
         self._estimated = self._at_limit = 0  # frames with a state; noise of the IMU at its limit
+        self._lost: list[tuple[int, int]] = []  # last good states, and when a loss was noticed
         self._started_ns: int | None = None
         self._first_ns: int | None = None
         config = result.config
@@ -138,7 +139,10 @@ class Verdict(Stage):
             DataError: if the run waits for its first state, and what it was given is certainly
                 wrong.
         """
-        stamp_ns = frame.features.stamp_ns
+        stamp_ns, segments = frame.features.stamp_ns, self._result.segments
+        ended = [segment.end_ns for segment in segments if segment.ended_by]
+        if len(ended) > len(self._lost):
+            self._lost.append((ended[-1], stamp_ns))
         if frame.restarted:
             self._estimated = self._at_limit = 0
         self._estimated += frame.initialized
@@ -256,7 +260,7 @@ class Verdict(Stage):
         from slam_graph.diagnosis import Diagnosis  # it takes a moment to import
 
         kept = self._kept
-        return Diagnosis.of_tracks(rig, kept.frames, kept.imu, kept.pairs)
+        return Diagnosis.of_tracks(rig, kept.frames, kept.imu, kept.pairs, self._lost)
 
     def _final_rig(self) -> Rig:
         """The rig as calibrated, corrected or estimated, whichever came last."""
@@ -274,4 +278,5 @@ class Verdict(Stage):
         kept = self._kept
         if kept.pairs and kept.shared < _FEWEST_SHARED:
             return True
-        return bool(Diagnosis.nearby(self._final_rig(), kept.frames, kept.imu).setup_faults)
+        of = self._final_rig(), kept.frames, kept.imu, self._lost
+        return bool(Diagnosis.nearby(*of).setup_faults)

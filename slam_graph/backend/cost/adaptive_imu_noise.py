@@ -181,11 +181,11 @@ class DynamicsNoise:
         """Current parameters.
 
         Args:
-            scale: on all densities.
+            scale: on white noise, such as where samples are missing. Biases do not drift faster
+                then: how they are known is worth keeping until there are samples again.
             least_factor: least factor on white noise.
             change: of the motion since the interval before.
         """
-        scale *= self._config.imu_scale
         factors = self._scales.factors
         imu = replace(
             self._imu,
@@ -194,8 +194,8 @@ class DynamicsNoise:
         )
         if self._config.adaptive.enabled:
             imu = change.added_to(imu)
-        gyro, accel = (max(factor, least_factor) for factor in self.factors)
-        return imu.preintegration_params(self._config.gravity, scale, gyro, accel)
+        gyro, accel = (scale * max(factor, least_factor) for factor in self.factors)
+        return imu.preintegration_params(self._config.gravity, self._config.imu_scale, gyro, accel)
 
     @property
     def factors(self) -> tuple[float, float]:

@@ -29,7 +29,7 @@ from slam_graph.geometry import NavState
 from slam_graph.sensors import ImuBuffer, ImuData, ImuNoise
 
 IMU_GAP_SCALE = 1000.0
-"""Factor on the noise densities between two frames where samples are missing: the IMU then hardly
+"""Factor on the white noise between two frames where samples are missing: the IMU then hardly
 counts."""
 
 _VELOCITY = slice(6, 9)
@@ -73,12 +73,31 @@ def imu_factor(
     return gtsam.CombinedImuFactor(X(i), V(i), X(j), V(j), B(i), B(j), pim)
 
 
-def _velocity_correction(predicted: NavState, state: NavState) -> float:
-    """Squared Mahalanobis distance of a velocity from the predicted one, over its dimension."""
-    assert predicted.covariance is not None
-    off = state.velocity - predicted.velocity
-    square = off @ np.linalg.solve(predicted.covariance[_VELOCITY, _VELOCITY], off)
-    return float(square) / len(off)
+@dataclass(frozen=True, slots=True)
+class VelocityCorrection:
+    """How far an estimate is from the velocity that the IMU predicted.
+
+    Both are in variances of the prediction, over the three axes.
+
+    Attributes:
+        square: squared Mahalanobis distance.
+        expected: its mean if covariances are right. A correction has the covariance P⁻ - P⁺, so
+            this is between 0, where images tell nothing, and 1, where they tell all.
+    """
+
+    square: float
+    expected: float
+
+    @staticmethod
+    def of(predicted: NavState, state: NavState) -> VelocityCorrection:
+        """Compare an estimate with its prediction; both have a covariance."""
+        assert predicted.covariance is not None
+        assert state.covariance is not None
+        prior, off = predicted.covariance[_VELOCITY, _VELOCITY], state.velocity - predicted.velocity
+        columns = np.column_stack([off, state.covariance[_VELOCITY, _VELOCITY]])
+        solved = np.linalg.solve(prior, columns)
+        expected = 1.0 - float(np.trace(solved[:, 1:])) / len(off)
+        return VelocityCorrection(float(off @ solved[:, 0]) / len(off), max(expected, 0.0))
 
 
 class Propagation:
@@ -87,13 +106,21 @@ class Propagation:
     Attributes:
         noise: of the IMU; it adapts to the innovations where the settings ask for it.
         aiding: fixes and odometry between the frames; None for none.
+        guesses: whether the motion is a guess, without an IMU.
     """
 
-    def __init__(self, imu: ImuNoise, config: BackendConfig, diagnostics: Diagnostics) -> None:
+    def __init__(
+        self,
+        imu: ImuNoise,
+        config: BackendConfig,
+        diagnostics: Diagnostics,
+        guesses: bool = False,
+    ) -> None:
         self.config = config
         self.diagnostics = diagnostics
         self.noise = DynamicsNoise(imu, config.noise)
         self.aiding: Aiding | None = None
+        self.guesses = guesses
         self._density = config.noise.imu_scale * imu.accel_noise_density
         self.restart()
 
@@ -122,17 +149,21 @@ class Propagation:
             stamp_ns: time of the frame on the clock of the IMU.
             still: whether the platform has not moved.
             corrected: gives the state at which the new frame is linearised, from the last state and
-                the predicted one; this one if None.
+                the predicted one, where this is a guess or samples are missing. An estimate would
+                not find its way from there: the motion may be far from it.
         """
         i, j = window.frame, window.frame + 1
         previous = window.state.nav_state(i, window.stamp_ns, None)
         samples = imu.between(window.stamp_ns, stamp_ns)
         bias = window.state.frames.atConstantBias(B(i))
-        pim = samples.preintegrated(bias, self._params(imu, samples))
+        missing = self._misses_samples(imu, samples)
+        pim = samples.preintegrated(bias, self._params(samples, missing))
         self._samples = samples
         predicted = previous.predicted(pim, stamp_ns)
+        if not (missing or self.guesses):
+            corrected = None
         first = predicted if corrected is None else corrected(previous, predicted)
-        if corrected is not None and self.aiding is not None:
+        if self.guesses and corrected is not None and self.aiding is not None:
             first = self.aiding.by_odometry(previous, predicted) or first
         window.state.insert_imu_state(j, first)
         window.past.append(i)
@@ -181,7 +212,8 @@ class Propagation:
         """
         samples = imu.between(state.stamp_ns, stamp_ns)
         bias = gtsam.imuBias.ConstantBias(state.accel_bias, state.gyro_bias)
-        pim = samples.preintegrated(bias, self._params(imu, samples))
+        missing = self._misses_samples(imu, samples)
+        pim = samples.preintegrated(bias, self._params(samples, missing))
         predicted = state.predicted(pim, stamp_ns)
         if state.covariance is None:
             return predicted
@@ -195,21 +227,19 @@ class Propagation:
         """The state of the last frame with the covariance that vibration gives it."""
         return self._vibration.added_to(state)
 
-    def learn(self, state: NavState) -> float | None:
+    def learn(self, state: NavState) -> VelocityCorrection | None:
         """Adapt the noise of the IMU to the difference of an estimate from its prediction.
 
         Not at a standstill, whose zero velocity is no measurement of images.
 
         Returns:
-            Squared Mahalanobis distance of the velocity from its prediction, by the covariance of
-            the prediction, over its degrees of freedom; None where nothing was learned. Its mean is
-            below one if covariances are right: a correction is smaller than the error it corrects.
+            How the velocity was corrected; None where nothing was learned.
         """
         correction = None
         if self._last is not None and self._predicted is not None:
             if not self._still:
                 dt_s = (state.stamp_ns - self._last.stamp_ns) * 1e-9
-                correction = _velocity_correction(self._predicted, state)
+                correction = VelocityCorrection.of(self._predicted, state)
                 self.noise.learn(self._predicted, state, dt_s)
             if self._counts_vibration():
                 assert self._predicted.covariance is not None
@@ -218,11 +248,17 @@ class Propagation:
         self._last = state
         return correction
 
-    def _params(self, imu: ImuBuffer, samples: ImuData) -> gtsam.PreintegrationCombinedParams:
-        """Parameters of the preintegration; where samples are missing, with much larger noise."""
+    def _misses_samples(self, imu: ImuBuffer, samples: ImuData) -> bool:
+        """Whether there is a gap between samples from frame to frame; it is counted."""
         gap_s = imu.largest_gap_s(*samples.stamps_ns[[0, -1]].tolist())
-        change = MotionChange.between(self._samples, samples)
         if gap_s <= self.config.noise.max_imu_gap_s:
-            return self.noise.params(change=change)
+            return False
         self.diagnostics.warn("imu_gap_bridged", f"{gap_s:.3f} s without IMU samples")
-        return self.noise.params(IMU_GAP_SCALE, change=change)
+        return True
+
+    def _params(
+        self, samples: ImuData, missing: bool = False
+    ) -> gtsam.PreintegrationCombinedParams:
+        """Parameters of the preintegration; where samples are missing, with much larger noise."""
+        change = MotionChange.between(self._samples, samples)
+        return self.noise.params(IMU_GAP_SCALE if missing else 1.0, change=change)

@@ -264,11 +264,12 @@ class RecordingFactors:
 
     def _noise_factors(self, k: int) -> tuple[float, float, float]:
         """Factors on all noise after keyframe k; on white noise of gyroscope; of accelerometer."""
-        scale = self._backend.noise.imu_scale * (IMU_GAP_SCALE if self._gaps[k] else 1.0)
+        scale = IMU_GAP_SCALE if self._gaps[k] else 1.0
         i, j = self._segment.keyframes[k : k + 2]
         # variances of non-stationary noise add up
         learned = np.sqrt(np.mean(self._segment.noise[i + 1 : j + 1] ** 2, axis=0))
-        return (scale, *self.noise.white(*learned.tolist()))
+        gyro, accel = self.noise.white(*learned.tolist())
+        return self._backend.noise.imu_scale, scale * gyro, scale * accel
 
     def _dynamics(self, values: gtsam.Values) -> list[gtsam.NonlinearFactor]:
         """IMU factors between consecutive keyframes, and zero-velocity factors."""
