@@ -21,7 +21,7 @@ from functools import cached_property
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from slam_graph.arrays import FloatArray, median, skew
+from slam_graph.arrays import BoolArray, FloatArray, median, skew
 from slam_graph.diagnosis.frame_pairs import FramePair
 from slam_graph.diagnosis.gyroscope import Gyroscope
 from slam_graph.sensors import RigCamera
@@ -171,12 +171,13 @@ class RotationProblem:
         self._block = np.unique(blocks, axis=0, return_inverse=True)[1].ravel()
         rows = self._pixels[..., 1] / camera.camera.height - 0.5
         self._row = np.where(self._there, rows, 0.0)
-        self._bearings: dict[float, tuple[FloatArray, FloatArray]] = {}
+        self._bearings: dict[float, tuple[FloatArray, FloatArray, BoolArray]] = {}
 
-    def bearings(self, focal: float) -> tuple[FloatArray, FloatArray]:
+    def bearings(self, focal: float) -> tuple[FloatArray, FloatArray, BoolArray]:
         """Unit bearings (2, P, N, 3) with a factor on the focal lengths, and their derivatives.
 
-        The derivatives (2, P, N, 3, 2) are by the pixels.
+        The derivatives (2, P, N, 3, 2) are by the pixels. Last, which features (P, N) have both in
+        both frames: beyond the edge of a wide lens there is none.
         """
         if focal not in self._bearings:
             camera = self._mounted.camera
@@ -186,16 +187,17 @@ class RotationProblem:
                 m = scaled.undistort(moved.reshape(-1, 2)).reshape(moved.shape)
                 rays = np.concatenate([m, np.ones((*m.shape[:-1], 1))], axis=-1)
                 rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
+            known = self._there & np.all(np.isfinite(rays), axis=(0, 1, 4))
             rays = np.where(np.isfinite(rays), rays, 0.0)
             slopes = np.stack([rays[1] - rays[0], rays[2] - rays[0]], axis=-1)
             if len(self._bearings) > 4:
                 self._bearings.clear()
-            self._bearings[focal] = rays[0], slopes
+            self._bearings[focal] = rays[0], slopes, known
         return self._bearings[focal]
 
     def _turned(self, at: Kinematics) -> _Turned:
         """Bearings of both frames, turned into the camera of the first one."""
-        f, slopes = self.bearings(at.focal)
+        f, slopes, _ = self.bearings(at.focal)
         C, t = at.body_R_camera, self._t + at.offset_s
         R, rates = np.empty((2, len(self._part), 3, 3)), np.empty((2, len(self._part), 3))
         for number, gyroscope in enumerate(self._gyroscopes):
@@ -243,7 +245,7 @@ class RotationProblem:
     def noise_px(self, at: Kinematics) -> float:
         """Robust standard deviation of the epipolar distances, the directions fitted."""
         e = self.distances(at, self.directions(at, _LEAST_PX))
-        return _noise(e[self._there])
+        return _noise(e[self.bearings(at.focal)[2]])
 
     def solve(self, start: Kinematics, free: tuple[str, ...] = UNKNOWNS) -> RotationFit:
         """Gauss-Newton from a start; what is not free stays as it is."""
@@ -282,7 +284,7 @@ class RotationProblem:
         """Information (B, n, n) without the directions, and gradients (B, n), of blocks of time."""
         t = self.directions(at, noise)
         e, by_t = self.residuals(at, t)
-        J = np.empty((*e.shape, len(columns)))
+        J, known = np.empty((*e.shape, len(columns))), self.bearings(at.focal)[2]
         for c, k in enumerate(columns):
             change = np.zeros(9)
             change[k] = _STEP[k]
@@ -291,7 +293,7 @@ class RotationProblem:
         most = _JUMP * self._mounted.camera.fx / _LARGEST[columns]
         steady = np.all(np.abs(J) < most, axis=-1, keepdims=True)
         J = np.where(steady, J, 0.0)
-        root = np.sqrt(self._there / (1.0 + (e / (_CAUCHY * noise)) ** 2)) / noise
+        root = np.sqrt((known & steady[..., 0]) / (1.0 + (e / (_CAUCHY * noise)) ** 2)) / noise
         e, J, by_t = e * root, J * root[..., None], by_t * root[..., None]
         inner = by_t.transpose(0, 2, 1) @ by_t + 1e-9 * np.eye(2)
         gradients = np.einsum("pni,pn->pi", J, e)  # the directions are at their best: none by them
