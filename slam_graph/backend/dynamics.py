@@ -122,6 +122,9 @@ def model_rig(rig: Rig, config: DynamicsConfig) -> Rig:
 def without_imu(config: BackendConfig) -> BackendConfig:
     """The settings without gravity, and without all that compares images with an IMU.
 
+    The gate compares observations with a prediction, which is vague here, so it lets tracks pass
+    that are off by pixels. The loss has to see to them, and be one whose weight vanishes.
+
     Raises:
         ConfigError: if a time offset is to be estimated, which wants an IMU.
     """
@@ -133,9 +136,13 @@ def without_imu(config: BackendConfig) -> BackendConfig:
     noise = config.noise.model_copy(
         update={"gravity": 0.0, "max_imu_gap_s": _NO_GAP_S, "imu_scale": 1.0}
     )
+    gating = config.gating
+    if "robust_loss" not in gating.model_fields_set:
+        gating = gating.model_copy(update={"robust_loss": "cauchy"})
     return config.model_copy(
         update={
             "noise": noise,
+            "gating": gating,
             "zero_velocity": config.zero_velocity.model_copy(update={"enabled": False}),
             "initialization": config.initialization.model_copy(
                 update={"check_calibration": False, "fix_gauge": False}
