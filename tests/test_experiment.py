@@ -27,11 +27,12 @@ from slam_graph.evaluation.absolute_pose_error import ape
 from slam_graph.experiment.comparison import compare as compare_algorithms
 from slam_graph.experiment.comparison_figures import binned_mean
 from slam_graph.experiment.comparison_plan import load_configs, plan, with_variants
-from slam_graph.experiment.comparison_results import ALIGNMENTS
+from slam_graph.experiment.comparison_results import ALIGNMENTS, read_result
 from slam_graph.experiment.executors import ONE_THREAD, DaskCluster, LocalProcesses
 from slam_graph.experiment.tasks import RecordTask, RunTask, find_sources
 from slam_graph.pipeline.run_recording import run as run_pipeline
 from slam_graph.results.metrics import peak_memory_mb
+from slam_graph.simulation.simulator import simulate
 
 COMMAND = [sys.executable, "-m", "slam_graph.cli.main", "compare"]
 STATIC = ("--set", "backend.initialization.mode=static")
@@ -377,6 +378,25 @@ def test_compare_from_python(tmp_path: Path) -> None:
     )
     assert second.skipped == 2
     assert told == ["tracks of sim_figure8, seed 5", "swf on sim_figure8, seed 5"]
+
+
+def test_fixes_that_lie_elsewhere_are_compared_with(tmp_path: Path) -> None:
+    """Named as a source they are recorded with the tracks; changed ones are recorded anew."""
+    drive, fixes = tmp_path / "drive", tmp_path / "fixes.csv"
+    settings = {"with_imu": False, "seed": 1, "tracks": {"features": 60}}
+    simulate(trajectory="car", duration_s=25.0, gnss={"sigma_m": 0.3}, **settings).save(drive)
+    (drive / "gnss.csv").rename(fixes)
+    arguments = {"sources": {"gnss": str(fixes)}, "workers": 1, "output": tmp_path / "compared"}
+    done = compare_algorithms(drive, "msckf", **arguments)
+    assert not done.failures
+    (task,) = done.runs
+    result = read_result(task.result)
+    assert result is not None
+    assert result["metrics"]["world"]["of_fixes"]
+    assert compare_algorithms(drive, "msckf", **arguments).skipped == 2
+    lines = fixes.read_text().splitlines(keepends=True)
+    fixes.write_text("".join(lines[:-1]))
+    assert compare_algorithms(drive, "msckf", **arguments).skipped == 0
 
 
 def test_compare_with_unknown_names() -> None:

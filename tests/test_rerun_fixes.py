@@ -19,7 +19,15 @@ from slam_graph.results import RunResult
 from slam_graph.sensors import AidingData
 from slam_graph.visualization import RerunRecording
 from slam_graph.visualization.rerun_blueprints import GROWING
-from slam_graph.visualization.rerun_fixes import FIX_SIGMA, FIXES, FixLog
+from slam_graph.visualization.rerun_fixes import (
+    FIX_SIGMA,
+    FIXES,
+    POSE_AXES,
+    POSE_SIGMA,
+    POSES,
+    FixLog,
+    KnownPoseLog,
+)
 from slam_graph.visualization.rerun_palette import ORANGE, VERMILLION
 from slam_graph.visualization.rerun_stream import RerunStream
 
@@ -138,3 +146,47 @@ def test_ellipsoids_are_the_covariances(tmp_path: Path) -> None:
     again = np.einsum("nij,nj,nkj->nik", R, variances, R)
     np.testing.assert_allclose(again, covariances, rtol=1e-4, atol=1e-4)
     assert {FIXES, FIX_SIGMA} <= set(GROWING), "or the viewer shows the last one only"
+
+
+def test_known_poses_of_a_run_are_shown_in_their_world(tmp_path: Path) -> None:
+    flight = sg.simulate(
+        duration_s=8.0,
+        tracks={"features": 60},
+        known_poses={"position_sigma_m": 0.02, "rate_hz": 2.0},
+    )
+    viewer = RerunRecording("save", "poses", tmp_path / "poses.rrd").viewer()
+    result = sg.run(flight, viewer=viewer, final_ba={"enabled": False})
+    assert not result.warnings["viewer_failed"]
+    rows = rows_of(tmp_path / "poses.rrd")
+    (entity,) = (name for name in rows if name.endswith(f"/{POSES}"))
+    places = np.concatenate([row["positions"] for row in rows[entity]])
+    known = fixes_of(flight).within(None, int(result.trajectory.stamps_ns[-1]))
+    np.testing.assert_allclose(places, known.pose_positions[-len(places) :], rtol=1e-5, atol=1e-6)
+    assert len(places) > 8
+    assert not any(name.endswith(f"/{FIXES}") for name in rows)
+
+
+def test_axes_and_ellipsoids_of_known_poses_are_what_was_measured(tmp_path: Path) -> None:
+    rng = np.random.default_rng(4)
+    sigmas = rng.uniform(0.01, 0.1, (6, 6))
+    sigmas[1, 3:], sigmas[2, :3] = np.inf, np.inf  # a place without orientation, and the reverse
+    places, turns = rng.normal(size=(6, 3)), Rotation.random(6, random_state=1)
+    data = AidingData.empty().with_poses(np.arange(6), places, turns.as_quat(), sigmas)
+    stream = RerunStream("save", "poses", tmp_path / "poses.rrd")
+    stream.at(0, 0)
+    KnownPoseLog(stream, "world").add(data, np.arange(6) == 4)
+    stream.close()
+    rows = rows_of(tmp_path / "poses.rrd")
+    placed, both = [0, 1, 3, 4, 5], [0, 3, 4, 5]
+    (points,), (ellipsoids,), (axes,) = (
+        rows[f"/world/{name}"] for name in (POSES, POSE_SIGMA, POSE_AXES)
+    )
+    np.testing.assert_allclose(points["positions"], places[placed], rtol=1e-6)
+    reds = [colour(packed) == VERMILLION for packed in points["colors"]]
+    assert reds == [False, False, False, True, False]
+    sizes = np.sort(ellipsoids["half_sizes"], axis=1)
+    np.testing.assert_allclose(sizes, np.sort(sigmas[placed, :3], axis=1), rtol=1e-5)
+    vectors = np.reshape(axes["vectors"], (-1, 3, 3))
+    unit = vectors / np.linalg.norm(vectors, axis=2, keepdims=True)
+    np.testing.assert_allclose(unit, turns[both].as_matrix().transpose(0, 2, 1), atol=1e-6)
+    assert {POSES, POSE_SIGMA, POSE_AXES} <= set(GROWING), "or the viewer shows the last one only"

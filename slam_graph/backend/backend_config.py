@@ -86,7 +86,8 @@ class GatingConfig(Settings):
     moving objects disturb the estimate; more correct features are then lost as well."""
     robust_loss: Literal["none", "huber", "cauchy"] = "huber"
     """Loss that reduces the weight of large reprojection residuals. `cauchy` lets that of outliers
-    vanish, but needs a better start; `none` is for data without outliers, such as simulations."""
+    vanish, but needs a better start; `none` is for data without outliers, such as simulations.
+    Stereo and RGB-D without an IMU: `cauchy`, unless another one is given."""
 
     moved: ClassVar[Mapping[str, str]] = {
         "robust_width": "is a constant now: WIDTH_2D in backend/cost/robust_loss.py",

@@ -71,7 +71,7 @@ class Dynamics:
         return ConstantVelocity(
             model_rig(rig, config.dynamics),
             without_prediction(algorithm, rig),
-            without_imu(config),
+            without_imu(config, rig.has_scale),
         )
 
     def extend(self, imu: ImuBuffer, until_ns: int) -> None:
@@ -119,8 +119,16 @@ def model_rig(rig: Rig, config: DynamicsConfig) -> Rig:
     return replace(rig, imu=noise, has_imu=False)
 
 
-def without_imu(config: BackendConfig) -> BackendConfig:
+def without_imu(config: BackendConfig, has_scale: bool) -> BackendConfig:
     """The settings without gravity, and without all that compares images with an IMU.
+
+    The gate compares observations with a prediction, which is vague here, so it lets tracks pass
+    that are off by pixels. The loss has to see to them, and be one whose weight vanishes; not where
+    lengths are not measured, as it may then lose the way from a poor scale.
+
+    Args:
+        config: the settings.
+        has_scale: whether the cameras measure lengths.
 
     Raises:
         ConfigError: if a time offset is to be estimated, which wants an IMU.
@@ -133,9 +141,13 @@ def without_imu(config: BackendConfig) -> BackendConfig:
     noise = config.noise.model_copy(
         update={"gravity": 0.0, "max_imu_gap_s": _NO_GAP_S, "imu_scale": 1.0}
     )
+    gating = config.gating
+    if has_scale and "robust_loss" not in gating.model_fields_set:
+        gating = gating.model_copy(update={"robust_loss": "cauchy"})
     return config.model_copy(
         update={
             "noise": noise,
+            "gating": gating,
             "zero_velocity": config.zero_velocity.model_copy(update={"enabled": False}),
             "initialization": config.initialization.model_copy(
                 update={"check_calibration": False, "fix_gauge": False}

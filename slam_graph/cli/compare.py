@@ -15,9 +15,11 @@ from slam_graph.cli.options import (
     ConfigFile,
     Json,
     Overrides,
+    Sources,
     TlsCaFile,
     TlsCert,
     TlsKey,
+    sources_from,
     tls_files,
 )
 
@@ -78,6 +80,7 @@ def compare(
             "--groundtruth", metavar="DATA=PATH", help="True trajectory of a recording; repeatable."
         ),
     ] = None,
+    sources: Sources = None,
     progress: Annotated[
         bool, typer.Option("--progress/--no-progress", help="Show progress on stderr.")
     ] = True,
@@ -99,6 +102,7 @@ def compare(
             overrides=set_ or (),
             simulation=sim_set or (),
             groundtruth=_truths(groundtruth or []),
+            sources=sources_from(sources),
             without_fej=without_fej,
             workers=workers,
             scheduler=scheduler,

@@ -19,6 +19,7 @@ from slam_graph.evaluation.alignment_covariance import aligned_by_smoothed
 from slam_graph.evaluation.consistency import CONFIDENCE, Nees, mean_bounds, nees, ratio_bounds
 from slam_graph.evaluation.relative_pose_error import rpe
 from slam_graph.evaluation.truth_pairing import synchronize
+from slam_graph.evaluation.unknown_scale import scale_of_covariances
 from slam_graph.geometry import (
     AlignmentMode,
     Similarity,
@@ -146,8 +147,9 @@ def nees_of_run(
     - `yaw`: over the whole run, by the smoothed trajectory (`alignment_covariance.py`);
     - `first_pose`, without one: at the first state, relative to which covariances are. A truth
       whose orientation is wrong there turns all positions;
-    - `first_pose_and_scale`, where nothing measures lengths: the scale is that of `sim3` over the
-      whole run. So a wrong scale as a whole is no error, and one that drifts is.
+    - `first_pose_and_scale`, where nothing measures lengths: the scale, too, is that to which
+      covariances are relative (`unknown_scale.py`). So a wrong scale as a whole is no error, and
+      one that drifts is.
 
     Args:
         truth: the true trajectory.
@@ -167,7 +169,9 @@ def nees_of_run(
         if found is not None:
             return nees(estimate, found[1], truth, found[0]), "yaw"
     if not history.has_scale:
-        scale = Similarity.of_positions(true.positions, own.positions, "sim3").scale
+        scale = scale_of_covariances(truth, estimate, covariances)
+        if scale is None:
+            scale = Similarity.of_positions(true.positions, own.positions, "sim3").scale
         scaled = Similarity(np.eye(3), np.zeros(3), scale)
         first = Similarity.of_first_pose(true, scaled.apply(own), level=False)
         return nees(

@@ -33,6 +33,7 @@ def compare(
     overrides: Iterable[str] = (),
     simulation: Iterable[str] = (),
     groundtruth: Mapping[str, str | Path] | None = None,
+    sources: Mapping[str, str] | None = None,
     without_fej: bool = False,
     workers: int | None = None,
     scheduler: str | None = None,
@@ -58,6 +59,8 @@ def compare(
         overrides: `a.b=value` for all runs, as `--set` takes them.
         simulation: `a.b=value` for all simulations.
         groundtruth: paths of ground truth, by the path of the recording as in `data`.
+        sources: where sensors of the recordings are that are not found by themselves: `gnss`,
+            `poses`, `odometry`, topics of bags, as `open_dataset` takes them.
         without_fej: whether to run each algorithm also without first-estimates Jacobians, under the
             name NAME_no_fej.
         workers: processes at a time; the number of cores if None.
@@ -84,9 +87,9 @@ def compare(
     if without_fej:
         configs = with_variants(configs)
     inputs = [data] if isinstance(data, (str, Path)) else data
-    sources = find_sources(inputs, settings.get("duration_s"), simulation, groundtruth)
+    found = find_sources(inputs, settings.get("duration_s"), simulation, groundtruth, sources)
     executor = executor_for(workers, scheduler, tls)
-    comparison = run_tasks(sources, configs, seeds, output, executor, progress or _ignore)
+    comparison = run_tasks(found, configs, seeds, output, executor, progress or _ignore)
     write_report(comparison)
     return comparison
 

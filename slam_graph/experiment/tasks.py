@@ -23,6 +23,7 @@ from pydantic import Field, TypeAdapter
 from slam_graph.config import RunConfig
 from slam_graph.datasets import Sequence, TrackRecorder, open_dataset
 from slam_graph.errors import ConfigError, DataError, closest
+from slam_graph.experiment.batch_plan import absolute_sources
 from slam_graph.experiment.batch_task import BatchTask
 from slam_graph.experiment.comparison_results import read_result, write_result
 from slam_graph.experiment.settings_hash import settings_hash
@@ -52,6 +53,10 @@ class Source(Settings):
     """Whether a seed changes anything."""
     extent: tuple[int, int, int] | None = None
     """Number of frames, first and last time of a recording; they reveal that it has changed."""
+    sources: dict[str, str] = Field(default_factory=dict)
+    """Where sensors of a recording are that are not found by themselves, such as fixes."""
+    written: dict[str, tuple[int, int]] = Field(default_factory=dict)
+    """Size and time of those of them that are files, for the same reason."""
 
     def open(self, seed: int, cameras: int | None) -> Sequence:
         """The sequence; of a simulation, that with the given seed.
@@ -63,7 +68,8 @@ class Source(Settings):
             return simulate(self.simulation, seed=seed, cameras=cameras)
         assert self.recording is not None
         truth = None if self.groundtruth is None else Path(self.groundtruth)
-        return open_dataset(self.recording, cameras=cameras, groundtruth=truth)
+        sources = self.sources or None
+        return open_dataset(self.recording, cameras=cameras, groundtruth=truth, sources=sources)
 
 
 def find_sources(
@@ -71,6 +77,7 @@ def find_sources(
     duration_s: float | None,
     overrides: Iterable[str] = (),
     groundtruths: Mapping[str, str | Path] | None = None,
+    sensors: Mapping[str, str] | None = None,
 ) -> list[Source]:
     """The sources with the names that a user gives.
 
@@ -80,6 +87,7 @@ def find_sources(
         duration_s: length of the simulations.
         overrides: `key=value` of `SimulationConfig`, for all simulations.
         groundtruths: paths of ground truth, by the path of the recording as in `names`.
+        sensors: where sensors of all recordings are that are not found by themselves.
 
     Raises:
         DataError: if a recording cannot be opened.
@@ -92,7 +100,7 @@ def find_sources(
         if name.startswith(_PREFIX):
             source = _simulated(name.removeprefix(_PREFIX), duration_s, changes)
         else:
-            source = _recorded(name, truths.pop(name, None))
+            source = _recorded(name, truths.pop(name, None), sensors or {})
         if source.name in sources:
             raise ConfigError(f"{name}: another source is also called '{source.name}'; rename one")
         sources[source.name] = source
@@ -103,9 +111,11 @@ def find_sources(
     return list(sources.values())
 
 
-def _recorded(path: str, groundtruth: str | None) -> Source:
+def _recorded(path: str, groundtruth: str | None, sensors: Mapping[str, str]) -> Source:
     truth = None if groundtruth is None else Path(groundtruth)
-    info = open_dataset(path, groundtruth=truth).info()
+    places = absolute_sources(sensors, Path.cwd())
+    info = open_dataset(path, groundtruth=truth, sources=places or None).info()
+    files = {name: Path(where).stat() for name, where in places.items() if Path(where).is_file()}
     where = str(Path(path).resolve()) if Path(path).exists() else path
     return Source(
         name=_plain(info.name),
@@ -113,6 +123,8 @@ def _recorded(path: str, groundtruth: str | None) -> Source:
         groundtruth=None if truth is None else str(truth.resolve()),
         random=info.content == "images",
         extent=(info.frames, info.start_ns, info.end_ns),
+        sources=places,
+        written={name: (file.st_size, file.st_mtime_ns) for name, file in files.items()},
     )
 
 

@@ -258,6 +258,9 @@ GROWING = (
     "objects/trails",
     "fixes",
     "fixes/sigma",
+    "known_poses",
+    "known_poses/axes",
+    "known_poses/sigma",
 )
 """What accumulates in the world of a run."""
 

@@ -50,7 +50,8 @@ red, rejected by the gate. White points: past poses in the window; purple: keyfr
 algorithm or, where it has none, of loop closure or of the map, at the end of the run. Green: loop
 closures, large points at their ends, and the path after them. The arrow at the start is gravity.
 Ellipsoids at the body: 1σ and 3σ of its position. A dense cloud is the last depth image, coloured
-by depth. Orange points with ellipsoids (1σ) are position fixes; red, rejected by the gate.
+by depth. Orange points with ellipsoids (1σ) are position fixes, with axes known poses; red,
+rejected by the gate.
 
 **Moving objects.** Each has a colour of its own: points, trail, arrow of its velocity, and in the
 first camera its features and the region around them, with its number. Purple: what moves and is of

@@ -25,7 +25,7 @@ from slam_graph.visualization.rerun_blueprints import (
     odometry,
 )
 from slam_graph.visualization.rerun_depth import DepthView
-from slam_graph.visualization.rerun_fixes import FixLog
+from slam_graph.visualization.rerun_fixes import FixLog, KnownPoseLog
 from slam_graph.visualization.rerun_images import CameraViews
 from slam_graph.visualization.rerun_map import log_map, places_in_map
 from slam_graph.visualization.rerun_outcome import FinishedRun, OutcomeLog
@@ -236,6 +236,7 @@ class _Inputs:
         of_fixes: bool = False,
     ) -> None:
         self._fixes = FixLog(stream, "world") if of_fixes else None
+        self._poses = KnownPoseLog(stream, "world")
         self._stream, self._series, self._cameras = stream, series, cameras
         self.depth, self._images = DepthView(stream, "world/body/depth", rig), images
 
@@ -251,6 +252,8 @@ class _Inputs:
         if packet.aiding is not None and self._fixes is not None:
             fixes = packet.aiding.fix_positions, packet.aiding.fix_covariances
             self._fixes.add(*fixes, np.zeros(len(fixes[0]), np.bool_))
+            none_rejected = np.zeros(len(packet.aiding.pose_stamps_ns), np.bool_)
+            self._poses.add(packet.aiding, none_rejected)
         add_imu(self._series, number, packet)
 
 
