@@ -6,9 +6,10 @@ import gtsam
 import numpy as np
 import pytest
 from flight import AT_REST, Flight, packets, rig, room
+from scipy.linalg import null_space
 from scipy.spatial.transform import Rotation
 
-from slam_graph.arrays import FloatArray
+from slam_graph.arrays import FloatArray, skew
 from slam_graph.backend.backend_config import BackendConfig, InitializationConfig, PriorConfig
 from slam_graph.backend.estimator import Estimator
 from slam_graph.backend.initialization.first_state import (
@@ -51,6 +52,33 @@ def test_tilt_and_gyro_bias_are_recovered(roll: float, pitch: float) -> None:
     for zero in (state.world_T_body.translation(), state.velocity, state.accel_bias):
         np.testing.assert_array_equal(zero, 0.0)
     assert state.stamp_ns == 10**9
+
+
+@pytest.mark.parametrize(("roll", "pitch"), ATTITUDES)
+def test_tilt_and_accelerometer_bias_are_uncertain_together(roll: float, pitch: float) -> None:
+    """NEES of tilt and bias over many biases, and of the velocity that is gained in a second."""
+    rng = np.random.default_rng(2)
+    samples, up = at_rest(roll, pitch, np.zeros(3))
+    R = level_rotation(9.81 * up).matrix()
+    across = null_space(up[None]).T
+    squares, gained = [], []
+    for _ in range(400):
+        bias = rng.normal(0.0, PRIOR.accel_bias, 3)
+        moved = 9.81 * rng.normal(0.0, PRIOR.attitude_rad, 3)
+        force = samples.accel + bias + moved
+        state = state_at_rest(ImuData(samples.stamps_ns, samples.gyro, force), 10**9, PRIOR)
+        assert state.covariance is not None
+        estimated = state.world_T_body.rotation().matrix()
+        turn = gtsam.Rot3.Logmap(gtsam.Rot3(estimated.T @ R))
+        error = np.concatenate([across @ turn, bias])
+        rows = np.zeros((5, 15))
+        rows[:2, :3], rows[2:, 9:12] = across, np.eye(3)
+        squares.append(error @ np.linalg.solve(rows @ state.covariance @ rows.T, error))
+        # what is taken for acceleration: R̂ (f - b̂) - g, with the error of a rest that goes on
+        rows = np.concatenate([9.81 * skew(up), np.zeros((3, 6)), np.eye(3), np.zeros((3, 3))], 1)
+        gained.append(np.trace(across @ rows @ state.covariance @ rows.T @ across.T))
+    assert 4.5 < np.mean(squares) < 5.5
+    assert np.sqrt(np.max(gained)) < 2.0 * 9.81 * PRIOR.attitude_rad
 
 
 @pytest.mark.parametrize(("roll", "pitch"), ATTITUDES)

@@ -12,7 +12,7 @@ from dataclasses import replace
 import gtsam
 import numpy as np
 
-from slam_graph.arrays import FloatArray
+from slam_graph.arrays import FloatArray, skew
 from slam_graph.backend.backend_config import BackendConfig, PriorConfig
 from slam_graph.backend.online_calibration import CalibrationVariables
 from slam_graph.backend.solve.square_root import Layout, SquareRootInformation
@@ -26,21 +26,38 @@ def state_at_rest(samples: ImuData, stamp_ns: int, prior: PriorConfig) -> NavSta
     """The state of a platform that stood still while the samples were taken.
 
     Position and yaw are zero: they define the world frame. The accelerometer bias is not observable
-    apart from the tilt and starts at zero; the covariance allows for both.
+    apart from the tilt and starts at zero; the covariance has what they share.
 
     Args:
         samples: of the IMU at rest.
         stamp_ns: time of the state.
         prior: standard deviations.
     """
+    force = samples.accel.mean(axis=0)
     return NavState(
         stamp_ns,
-        gtsam.Pose3(level_rotation(samples.accel.mean(axis=0)), np.zeros(3)),
+        gtsam.Pose3(level_rotation(force), np.zeros(3)),
         np.zeros(3),
         accel_bias=np.zeros(3),
         gyro_bias=samples.gyro.mean(axis=0),
-        covariance=prior_covariance(prior),
+        covariance=_covariance_at_rest(force, prior),
     )
+
+
+def _covariance_at_rest(force: FloatArray, prior: PriorConfig) -> FloatArray:
+    """Covariance (15, 15) of a state whose tilt was taken from the specific force at rest.
+
+    The force is that of gravity, g u in the body frame, and the bias b. With R = R̂ exp(δ) the
+    levelled attitude R̂ u ∥ z has g u × (δ × u) = u × b, that is δ = u × b / g across u. Left out,
+    the two would be uncertain apart, and the first acceleration unknown by g times the tilt.
+
+    Args:
+        force: (3,) mean specific force, m/s².
+        prior: standard deviations; that of the attitude is what the bias does not explain.
+    """
+    root = np.eye(15)
+    root[:3, 9:12] = skew(force) / (force @ force)  # u / g
+    return np.asarray(root @ prior_covariance(prior) @ root.T)
 
 
 def level_rotation(specific_force: FloatArray) -> gtsam.Rot3:
