@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from slam_graph import run
+from slam_graph import load_config, run
 from slam_graph.backend.backend_config import BackendConfig, CalibrationConfig, DynamicsConfig
 from slam_graph.backend.depth_camera import with_depth_camera, with_depth_observed
 from slam_graph.backend.dynamics import Dynamics, model_rig, motionless_samples
@@ -68,6 +68,23 @@ def test_constant_velocity_has_the_covariance_of_white_noise_on_acceleration(
     assert found[3, 6] == pytest.approx(2.0**2 * seconds**2 / 2.0, rel=0.01)
     assert rate == pytest.approx(3.0**2 * seconds, rel=1e-3)
     assert rotation == pytest.approx(3.0**2 * seconds**3 / 3.0, rel=0.1)
+
+
+@pytest.mark.parametrize("algorithm", ["msckf", "fixed_lag_isam2"])
+@pytest.mark.parametrize("given", [(), ("backend.gating.robust_loss=huber",)])
+def test_settings_that_are_written_mean_the_same_when_they_are_read(
+    algorithm: str, given: tuple[str, ...], tmp_path: Path
+) -> None:
+    """What is not given follows from the sensors, and is not given in a file of all settings."""
+    config = load_config(algorithm, given)
+    written = tmp_path / "config.yaml"
+    written.write_text(config.as_yaml())
+    rig = simulate(with_imu=False, cameras=2, duration_s=1.0).rig
+    used = [Dynamics.of(rig, one.algorithm, one.backend) for one in (config, load_config(written))]
+    assert used[0].config.gating.loss == ("huber" if given else "cauchy")
+    for part in ("config", "algorithm"):
+        first, second = (getattr(dynamics, part).model_dump() for dynamics in used)
+        assert first == second
 
 
 def test_a_body_that_keeps_its_velocities_is_predicted_exactly() -> None:

@@ -84,10 +84,15 @@ class GatingConfig(Settings):
     confidence: float = expert(0.95, gt=0, lt=1)
     """Share of the correct features that the χ² gate (Mahalanobis distance) accepts. Lower it if
     moving objects disturb the estimate; more correct features are then lost as well."""
-    robust_loss: Literal["none", "huber", "cauchy"] = "huber"
+    robust_loss: Literal["none", "huber", "cauchy"] | None = None
     """Loss that reduces the weight of large reprojection residuals. `cauchy` lets that of outliers
     vanish, but needs a better start; `none` is for data without outliers, such as simulations.
-    Stereo and RGB-D without an IMU: `cauchy`, unless another one is given."""
+    Not given: `cauchy` with stereo and RGB-D without an IMU, else `huber`."""
+
+    @property
+    def loss(self) -> Literal["none", "huber", "cauchy"]:
+        """The robust loss, `huber` if none is given."""
+        return self.robust_loss or "huber"
 
     moved: ClassVar[Mapping[str, str]] = {
         "robust_width": "is a constant now: WIDTH_2D in backend/cost/robust_loss.py",

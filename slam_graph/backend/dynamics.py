@@ -142,7 +142,7 @@ def without_imu(config: BackendConfig, has_scale: bool) -> BackendConfig:
         update={"gravity": 0.0, "max_imu_gap_s": _NO_GAP_S, "imu_scale": 1.0}
     )
     gating = config.gating
-    if has_scale and "robust_loss" not in gating.model_fields_set:
+    if has_scale and gating.robust_loss is None:
         gating = gating.model_copy(update={"robust_loss": "cauchy"})
     return config.model_copy(
         update={
@@ -170,20 +170,16 @@ def without_prediction(algorithm: AlgorithmConfig, rig: Rig) -> AlgorithmConfig:
     if cost.max_state_features != 0 and rig.has_scale:
         more = _MORE_FEATURES if rig.depth is None else _MORE_WITH_DEPTH
         update: dict[str, Any] = {}
-        if "keep_lost_features" not in cost.model_fields_set:
+        if cost.keep_lost_features is None:
             update["keep_lost_features"] = True
         if cost.max_state_features is not None:
             update["max_state_features"] = round(more * cost.max_state_features)
         cost = cost.model_copy(update=update)
-    asked = smoother.model_fields_set
-    early = {
-        "spacing_s": 0.0,
-        "lag_s": 0.5 * smoother.lag_s,
-        "min_feature_frames": _STATE_FEATURE_FRAMES,
-        "min_parallax_rad": 0.0,
-    }
-    kept = asked.intersection(("min_feature_frames", "min_parallax_rad"))
-    early = {name: value for name, value in early.items() if name not in kept}
+    early: dict[str, Any] = {"spacing_s": 0.0, "lag_s": 0.5 * smoother.lag_s}
+    if smoother.min_feature_frames is None:
+        early["min_feature_frames"] = _STATE_FEATURE_FRAMES
+    if smoother.min_parallax_rad is None:
+        early["min_parallax_rad"] = 0.0
     return algorithm.model_copy(
         update={"cost": cost, "smoother": smoother.model_copy(update=early)}
     )

@@ -54,9 +54,10 @@ class CostPolicy(Settings):
     used, only features of the state count. every_step: in the cost of every step, linearised anew,
     until a pose that saw it leaves; then it becomes part of the prior, and starts anew if it is
     still tracked."""
-    keep_lost_features: bool = False
+    keep_lost_features: bool | None = None
     """Whether features of the state that are no longer tracked are kept for when they come back:
-    for front ends and simulations that recognise features."""
+    for front ends and simulations that recognise features. Not given: with stereo and RGB-D without
+    an IMU only."""
     max_state_features: int | None = Field(40, ge=0)
     """How many features are held in the state while they are tracked; null for no bound, 0 for the
     textbook MSCKF. Long-lived features in the state lower the drift and cost time."""
@@ -156,10 +157,13 @@ class CostPolicy(Settings):
         return self.max_past_poses + recent + 2
 
     def _refuse(self, names: tuple[str, ...], reason: str) -> None:
-        """Refuse settings that are not at their defaults although they have no effect."""
+        """Refuse settings that are not at their defaults although they have no effect.
+
+        A switch may be off in any case.
+        """
         for name in names:
             value: Any = getattr(self, name)
-            if value != type(self).model_fields[name].default:
+            if value != type(self).model_fields[name].default and value is not False:
                 raise ValueError(f"{name}: {value} has no effect: {reason}; remove the line")
 
 
@@ -220,10 +224,21 @@ class SmootherPolicy(Settings):
     robust_loss: Literal["none", "huber", "cauchy"] = expert("cauchy")
     """Loss on reprojection residuals, instead of that of `backend.gating`: an outlier that is in
     the graph stays there, so its weight must be able to vanish."""
-    min_feature_frames: int = expert(5, ge=2)
-    """How many states must have seen a feature before it may become a variable."""
-    min_parallax_rad: float = expert(0.02, ge=0)
-    """Smallest angle between two rays to such a feature."""
+    min_feature_frames: int | None = expert(None, ge=2)
+    """How many states must have seen a feature before it may become a variable. Not given: 5, or 2
+    without an IMU."""
+    min_parallax_rad: float | None = expert(None, ge=0)
+    """Smallest angle between two rays to such a feature. Not given: 0.02, or 0 without an IMU."""
+
+    @property
+    def feature_frames(self) -> int:
+        """How many states must have seen a feature before it may become a variable."""
+        return 5 if self.min_feature_frames is None else self.min_feature_frames
+
+    @property
+    def feature_parallax_rad(self) -> float:
+        """Smallest angle between two rays to such a feature."""
+        return 0.02 if self.min_parallax_rad is None else self.min_parallax_rad
 
 
 _OWN_SECTIONS = ("cost", "gauss_newton", "marginalization")

@@ -122,7 +122,7 @@ class CostConstruction:
         self._features = FEATURE_POLICIES[policy.features]
         self._selection = FeatureSelection(policy, rig, config, diagnostics, pixels)
         self._select_poses = POSE_SELECTIONS[policy.past_poses]
-        self._loss = RobustLoss(config.gating.robust_loss)
+        self._loss = RobustLoss(config.gating.loss)
         self._failures: dict[int, int] = {}
 
     def construct(self, window: Window, still: bool) -> ConstructedCost:
@@ -206,7 +206,7 @@ class CostConstruction:
         count = self.policy.recent_frames - 1
         recent = set(window.past[-count:]) if count else set()
         moving = [i for i in window.moving if i in recent and i in poses.kept]
-        keep_lost = self.policy.keep_lost_features and window.lost_features.open
+        keep_lost = bool(self.policy.keep_lost_features) and window.lost_features.open
         none = np.zeros(0, np.bool_)
         return ConstructedCost(cost, None, poses, moving, features, none, none, keep_lost, removals)
 

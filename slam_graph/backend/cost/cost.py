@@ -124,7 +124,7 @@ class Cost:
     @property
     def robust(self) -> RobustLoss:
         """The loss on reprojection residuals."""
-        return self.loss or RobustLoss(self.config.gating.robust_loss)
+        return self.loss or RobustLoss(self.config.gating.loss)
 
     def sigmas(self, obs: Observations) -> FloatArray:
         """Standard deviations (N,) of observations, in pixels."""

@@ -242,14 +242,14 @@ class SmootherFeatures:
     ) -> tuple[Observations, FloatArray]:
         """New variables: the longest current tracks that determine a point."""
         ids, lengths = tracks.lengths()
-        ready = (lengths >= self._policy.min_feature_frames) & is_in(ids, tracks.ids_in(frame))
+        ready = (lengths >= self._policy.feature_frames) & is_in(ids, tracks.ids_in(frame))
         ids, lengths = ids[ready], lengths[ready]
         obs = tracks.observations(ids)
         if len(ids) == 0 or room <= 0:
             return obs.subset(np.zeros(len(ids), np.bool_)), np.zeros((0, 3))
         poses = stacked_poses(estimate, obs.frames)
         result = triangulate(
-            obs, self._rig, *poses, self._config.triangulation, self._policy.min_parallax_rad
+            obs, self._rig, *poses, self._config.triangulation, self._policy.feature_parallax_rad
         )
         fits = result.reprojection_px < OUTLIER_SIGMAS * self._config.noise.pixel_sigma
         good = result.good & fits

@@ -235,7 +235,7 @@ class DynamicRefinement:
         known = context.calibration.enter(state, SquareRootInformation.empty())
         for k, (stamp_ns, frame) in enumerate(zip(frames.stamps_ns, frames.frames, strict=True)):
             context.calibration.note_motion(state, k, stamp_ns, frame.stamp_ns, context.imu)
-        loss = RobustLoss(context.config.gating.robust_loss)
+        loss = RobustLoss(context.config.gating.loss)
         cost = BatchCost(state, context.projection, context.config, known, factors, loss=loss)
         obs = _lasting(frames)
         result = cost.triangulated(obs)

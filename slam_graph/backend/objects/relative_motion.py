@@ -235,7 +235,7 @@ def object_settings(backend: BackendConfig, config: ObjectsConfig) -> BackendCon
     default = BackendConfig()
     # few features, close together, do not show their noise; that of the platform's is given
     noise = {"adaptive_pixels": "never"}
-    loss = {"robust_loss": backend.gating.robust_loss}  # said, or it would be that of no IMU
+    loss = {"robust_loss": backend.gating.loss}  # said, or it would be that of no IMU
     return backend.model_copy(
         update={
             "noise": backend.noise.model_copy(update=noise),
