@@ -247,7 +247,7 @@ def test_the_dynamics_do_not_measure_the_scale_where_a_frame_is_linearised() -> 
     local, ids = np.asarray(true.transformTo(points.T)).T, np.arange(len(points))
     m = local[:, :2] / local[:, 2:]
     frame = FeatureFrame(50_000_000, (FeatureObservations(ids, CAMERA.project(local), m),))
-    found = VisualMotion(rig, 10).corrected(before, predicted, frame, (ids, points))
+    found = VisualMotion(rig, 10).corrected(before, predicted, (None, frame), (ids, points))
     assert found.world_T_body.rotation().equals(true.rotation(), 1e-4)
 
     def pull(later: NavState) -> float:
