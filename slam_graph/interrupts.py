@@ -27,6 +27,7 @@ class Deferred:
 
     def __init__(self) -> None:
         self.heard = False
+        self._answered = False  # the signal that was heard has taken effect
         self._at_once = False
         self._before: signal._HANDLER | None = None
 
@@ -58,7 +59,14 @@ class Deferred:
             KeyboardInterrupt: if there was one.
         """
         if self.heard:
+            self._answered = True
             raise KeyboardInterrupt
+
+    def take(self) -> bool:
+        """Whether there was a signal that has not taken effect; it counts as answered from now."""
+        pending = self.heard and not self._answered
+        self._answered |= pending
+        return pending
 
     @contextmanager
     def at_once(self) -> Iterator[None]:
@@ -80,6 +88,7 @@ class Deferred:
         finally:
             self._at_once = False
             interrupted, self.heard = self.heard, before or self.heard
+            self._answered |= interrupted
         if interrupted:
             raise KeyboardInterrupt
 

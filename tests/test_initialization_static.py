@@ -81,6 +81,13 @@ def test_tilt_and_accelerometer_bias_are_uncertain_together(roll: float, pitch: 
     assert np.sqrt(np.max(gained)) < 2.0 * 9.81 * PRIOR.attitude_rad
 
 
+def test_an_accelerometer_that_measures_nothing_levels_nothing() -> None:
+    none = ImuData(np.arange(200) * 5_000_000, np.zeros((200, 3)), np.zeros((200, 3)))
+    covariance = state_at_rest(none, 10**9, PRIOR).covariance
+    assert covariance is not None
+    np.testing.assert_array_equal(covariance, prior_covariance(PRIOR))
+
+
 @pytest.mark.parametrize(("roll", "pitch"), ATTITUDES)
 def test_levelling_is_exact_and_has_no_yaw(roll: float, pitch: float) -> None:
     force = Rotation.from_euler("ZYX", [0.0, pitch, roll]).inv().apply(9.81 * UP)

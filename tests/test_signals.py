@@ -261,6 +261,16 @@ class Finishes(Stage):
         self.done = True
 
 
+def test_a_signal_between_the_last_frame_and_the_stages_counts(flight: Path) -> None:
+    result = run(flight, duration_s=1.0, final_ba={"enabled": False})
+    last = Finishes()
+    with Interrupts.deferred() as interrupts:
+        signal.raise_signal(signal.SIGINT)
+        finish([last], result, interrupts)
+    assert last.done
+    assert result.status == "interrupted"
+
+
 @pytest.mark.parametrize(
     ("stage", "status"),
     [

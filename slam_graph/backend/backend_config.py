@@ -91,7 +91,7 @@ class GatingConfig(Settings):
 
     @property
     def loss(self) -> Literal["none", "huber", "cauchy"]:
-        """The robust loss, `huber` if none is given."""
+        """The robust loss that is given, else `huber`; `Dynamics.of` gives what sensors ask for."""
         return self.robust_loss or "huber"
 
     moved: ClassVar[Mapping[str, str]] = {

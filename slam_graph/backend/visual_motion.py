@@ -34,7 +34,7 @@ from slam_graph.sensors import FeatureFrame, Rig, RigCamera
 ERROR_PX = 4.0
 """Largest error of a point that fits the motion."""
 _SAME_NS = 5_000_000
-"""The time from frame to frame is that from state to state, to so much."""
+"""The last frame is used if the time since it is that since the last state, to so much."""
 _LEAST_SHARE = 0.5
 """Part of the known points that must fit it."""
 _ROUNDS = 3
@@ -55,7 +55,7 @@ class VisualMotion:
         self._last: FeatureFrame | None = None
 
     def note(self, frame: FeatureFrame) -> FeatureFrame | None:
-        """Note the next frame; the one before it."""
+        """Note the next frame, and return the one before it."""
         last, self._last = self._last, frame
         return last
 
@@ -84,7 +84,7 @@ class VisualMotion:
         ids, points = self._known(before, last, known)
         found = predicted
         for _ in range(_ROUNDS if self._rig.rolling else 1):
-            pose = self._pose(frame, ids, points, self._rate(found))
+            pose = self._pose(frame, ids, points, self._rate(found, before))
             if pose is None:
                 return predicted
             if not self._rig.has_scale:
@@ -92,9 +92,17 @@ class VisualMotion:
             found = moved_to(before, predicted, pose, self._rig.has_imu)
         return found
 
-    def _rate(self, state: NavState) -> FloatArray:
-        """Angular rate (3,) of the body, rad/s: without an IMU that is the bias, negative."""
-        return np.zeros(3) if self._rig.has_imu else -state.gyro_bias
+    def _rate(self, state: NavState, before: NavState | None = None) -> FloatArray:
+        """Angular rate (3,) of the body, rad/s: without an IMU that is the bias, negative.
+
+        With one it is the mean since the state before, or not known without that.
+        """
+        if not self._rig.has_imu:
+            return -state.gyro_bias
+        if before is None:
+            return np.zeros(3)
+        turn = before.world_T_body.rotation().between(state.world_T_body.rotation())
+        return np.asarray(gtsam.Rot3.Logmap(turn)) / ((state.stamp_ns - before.stamp_ns) * 1e-9)
 
     def _known(
         self, before: NavState, last: FeatureFrame | None, known: tuple[IntArray, FloatArray]
@@ -171,9 +179,10 @@ def depths_within(
 def moved_to(
     before: NavState, predicted: NavState, pose: gtsam.Pose3, with_imu: bool = False
 ) -> NavState:
-    """A predicted state at another pose, with the mean velocity and rate that lead there.
+    """A predicted state at another pose, with the change of velocity and rate that leads there.
 
-    With an IMU its bias says nothing of the rate, and stays.
+    By constant velocity these are the mean ones then. With an IMU the bias says nothing of the
+    rate, and stays.
 
     White noise would let both change by half as much again; but with a rolling shutter the rate
     moves the rows, and so the pose that PnP finds: the two then overshoot in turn.
@@ -182,9 +191,6 @@ def moved_to(
     was = predicted.world_T_body
     turn = gtsam.Rot3.Logmap(was.rotation().between(pose.rotation()))
     shift = pose.translation() - was.translation()
-    return replace(
-        predicted,
-        world_T_body=pose,
-        velocity=predicted.velocity + shift / seconds,
-        gyro_bias=predicted.gyro_bias - (0.0 if with_imu else 1.0) * turn / seconds,
-    )
+    velocity = predicted.velocity + shift / seconds
+    moved = replace(predicted, world_T_body=pose, velocity=velocity)
+    return moved if with_imu else replace(moved, gyro_bias=moved.gyro_bias - turn / seconds)

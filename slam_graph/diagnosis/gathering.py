@@ -32,6 +32,8 @@ _MARGIN_NS = 300_000_000
 
 _PAUSE_NS, _GAP_NS = 500_000_000, 200_000_000
 """Nothing is compared across longer times without frames, and without samples."""
+_PAUSE_FRAMES = 3.0
+"""With a slow camera the first of them is so many times that from frame to frame."""
 
 _MATCHED_FRAMES = 3
 """The second camera is looked at in every third frame."""
@@ -125,7 +127,10 @@ def uninterrupted(part: Part, lost: Sequence[tuple[int, int]] = ()) -> list[Part
     stretch = np.searchsorted(begins, stamps, side="right")
     ends = np.array([end for _, end in lost], np.int64)
     piece = stretch + np.searchsorted(ends, stamps, side="right")
-    piece[1:] += np.cumsum(np.diff(stamps) > _PAUSE_NS)
+    spacing = np.diff(stamps)
+    if len(spacing):
+        pause_ns = max(_PAUSE_NS, _PAUSE_FRAMES * float(np.median(spacing)))
+        piece[1:] += np.cumsum(spacing > pause_ns)
     of_sample = np.searchsorted(begins, samples, side="right")
     pieces = []
     for k in np.unique(piece):

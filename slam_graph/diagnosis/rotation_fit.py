@@ -219,13 +219,13 @@ class RotationProblem:
 
     def directions(self, at: Kinematics, noise: float) -> FloatArray:
         """Directions (P, 3) of the translations that fit best, robustly."""
-        turned = self._turned(at)
-        weights = self._there / np.maximum(np.sum(turned.normals**2, axis=-1), 1e-6)
+        turned, known = self._turned(at), self.bearings(at.focal)[2]
+        weights = known / np.maximum(np.sum(turned.normals**2, axis=-1), 1e-6)
         t = _least(_scatter(turned.normals, weights))
         for _ in range(_DIRECTIONS):
             e, sigma = turned.distances(t)
-            scale = np.maximum(_scales(np.abs(e), self._there), noise)[:, None]
-            weights = self._there / (1.0 + (e / (_CAUCHY * scale)) ** 2) / sigma**2
+            scale = np.maximum(_scales(np.abs(e), known), noise)[:, None]
+            weights = known / (1.0 + (e / (_CAUCHY * scale)) ** 2) / sigma**2
             by_noise = np.einsum("pn,pnij->pij", weights * e**2, turned.noise)
             t = _least(_scatter(turned.normals, weights) - by_noise)
         return t
@@ -245,7 +245,8 @@ class RotationProblem:
     def noise_px(self, at: Kinematics) -> float:
         """Robust standard deviation of the epipolar distances, the directions fitted."""
         e = self.distances(at, self.directions(at, _LEAST_PX))
-        return _noise(e[self.bearings(at.focal)[2]])
+        known = self.bearings(at.focal)[2]
+        return _noise(e[known]) if known.any() else np.inf
 
     def solve(self, start: Kinematics, free: tuple[str, ...] = UNKNOWNS) -> RotationFit:
         """Gauss-Newton from a start; what is not free stays as it is."""
@@ -315,9 +316,11 @@ def _least(moments: FloatArray) -> FloatArray:
     return np.asarray(np.linalg.eigh(moments)[1][:, :, 0])
 
 
-def _scales(sizes: FloatArray, there: FloatArray) -> FloatArray:
-    """Robust standard deviations (P,) of residuals (P, N)."""
-    return _SIGMA_OF_MEDIAN * np.nanmedian(np.where(there, sizes, np.nan), axis=1)
+def _scales(sizes: FloatArray, there: BoolArray) -> FloatArray:
+    """Robust standard deviations (P,) of residuals (P, N); zero where there are none."""
+    present = np.where(there, sizes, np.nan)
+    present[~there.any(axis=1)] = 0.0
+    return np.asarray(_SIGMA_OF_MEDIAN * np.nanmedian(present, axis=1))
 
 
 def _covariance(information: FloatArray, scores: FloatArray, prior: FloatArray) -> FloatArray:

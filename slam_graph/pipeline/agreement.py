@@ -34,10 +34,14 @@ _MOST_UNFIT, _SOONER = 0.9, 5.0 / 6.0
 other one. Most of the tracks may be on a wall that moves; nearly all do not fit a lost state."""
 _CORRECTED_S, _FEWEST_CORRECTIONS = 0.5, 5
 """Corrections of the velocity are summed over so long, and over so many."""
-_MOST_CORRECTED, _BEYOND_EXPECTED = 1.2, 8.0
-"""Largest mean of their squares, in variances of the prediction and in what is expected. The first
-is below one if covariances are right, and tells where images hardly do. Where tracks were broken,
-good runs have up to 0.8 and 5, and those that take another velocity over 1.9 and 19 or more."""
+_MOST_CORRECTED = 1.2
+"""The state is lost if the mean of their squares is larger, in variances of the prediction: it is
+at most one if covariances are right. Good runs have up to 0.8 where tracks were broken, and those
+that take another velocity over 1.9 or more. It tells where images hardly do, as little is expected
+then."""
+_BEYOND_EXPECTED = 8.0
+"""The sum of the squares must also exceed that which covariances let expect so many times. Good
+runs have up to 5, those that take another velocity over 19 or more."""
 _FOUND_AGAIN, _BROKEN_NS = 0.5, 1_500_000_000
 """Tracks are broken where fewer of them go on to the next frame; corrections count for so long."""
 _MOST_WAITING = 100

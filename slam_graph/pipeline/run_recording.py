@@ -115,16 +115,17 @@ def run(
     ]
 
     with ExitStack() as resources, Interrupts.deferred() as interrupts:
-        with outcome(result, estimator), _tracked(tracking, result, sequence) as packets:
-            for stage in stages:
-                stage.begin(resources)
-            for tracked in packets:
-                frame = objects.noted(estimation.estimate(tracked))
+        with outcome(result, estimator):
+            with _tracked(tracking, result, sequence) as packets:
                 for stage in stages:
-                    stage.frame(frame)
-                tracking.give_feedback(objects.feedback(frame.feedback()))
-                interrupts.check()
-            estimation.finish()
+                    stage.begin(resources)
+                for tracked in packets:
+                    frame = objects.noted(estimation.estimate(tracked))
+                    for stage in stages:
+                        stage.frame(frame)
+                    tracking.give_feedback(objects.feedback(frame.feedback()))
+                    interrupts.check()
+                estimation.finish()
             interrupts.check()
         finish(stages, result, interrupts)
     result.warnings = +sequence.diagnostics.counts

@@ -8,6 +8,7 @@ import logging
 import time
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from typing import Literal
 
 from slam_graph.backend import Estimator
 from slam_graph.errors import SlamGraphError
@@ -32,12 +33,8 @@ def outcome(result: RunResult, estimator: Estimator) -> Iterator[None]:
         ending.error = interrupt
     except DivergenceError as error:
         ending.status, ending.message, ending.error = "diverged", str(error), error
-    except SlamGraphError as error:
-        ending.status, ending.message, ending.error = "failed", str(error), error
     except Exception as error:
-        logger.exception("internal error")
-        ending.status, ending.error = "failed", error
-        ending.message = f"internal error: {type(error).__name__}: {error}"
+        ending.status, ending.error, ending.message = "failed", error, _reported(error)
     ending.wall_s = time.perf_counter() - began
     level = logging.INFO if ending.status == "ok" else logging.ERROR
     done = f"{result.logs.frames} frames in {ending.wall_s:.1f} s"
@@ -55,19 +52,32 @@ def finish(stages: Iterable[Stage], result: RunResult, interrupts: Deferred) -> 
         interrupts: Ctrl-C takes effect within stages only.
     """
     ending = result.ending
+
+    def note(status: Literal["interrupted", "failed"], error: BaseException, message: str) -> None:
+        if ending.status in COMPLETED:  # what went wrong before says more
+            ending.status, ending.error, ending.message = status, error, message
+
+    late = "interrupted after the last frame"
     for stage in stages:
+        if interrupts.take():  # between two stages
+            note("interrupted", KeyboardInterrupt(), late)
         try:
             with interrupts.at_once():
                 stage.finish()
         except KeyboardInterrupt as interrupt:
-            if ending.status in COMPLETED:  # what went wrong before says more
-                ending.status, ending.error = "interrupted", interrupt
-                ending.message = "interrupted after the last frame"
+            note("interrupted", interrupt, late)
         except Exception as error:
-            logger.exception("internal error")
-            if ending.status in COMPLETED:
-                ending.status, ending.error = "failed", error
-                ending.message = f"internal error: {type(error).__name__}: {error}"
+            note("failed", error, _reported(error))
+    if interrupts.take():
+        note("interrupted", KeyboardInterrupt(), late)
+
+
+def _reported(error: Exception) -> str:
+    """The message of an error; one that nobody expected is logged with its traceback."""
+    if isinstance(error, SlamGraphError):
+        return str(error)
+    logger.exception("internal error")
+    return f"internal error: {type(error).__name__}: {error}"
 
 
 def _judge(result: RunResult, estimator: Estimator) -> None:

@@ -41,13 +41,6 @@ from slam_graph.backend.solve.square_root import Layout, SquareRootInformation
 from slam_graph.backend.solve.state import POINT_DIM, POSE_DIM, State, dims_of, landmark_keys
 
 
-_FAR = 0.01
-"""Features outside the state are linearised at first estimates of the poses as long as these are
-within so much of their distance. Their points follow the current poses: a Jacobian with one at the
-first estimate and the other at the current one takes the difference for a known length, and so
-measures the scale, which one camera does not see just after it has moved off."""
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class TrackFeatures:
     """Features that enter the cost in this step with all of their observations.
@@ -250,8 +243,6 @@ class Cost:
         rig = self.rig.at(self.state)
         first = self._geometry(rig, obs, points, first=True)
         estimate = self._geometry(rig, obs, points)
-        if points is not None and _moved(first, estimate) > _FAR:
-            first = estimate
         return whiten(obs, rig, first, estimate, self.sigmas(obs), self.robust)
 
     def _geometry(
@@ -400,20 +391,6 @@ class Cost:
         columns = np.concatenate(parts, axis=1)
         self._columns = (obs, layout), columns
         return columns
-
-
-def _moved(first: Geometry, estimate: Geometry) -> float:
-    """How far estimates are from first ones, as a part of the median distance to the features.
-
-    That is the largest change of the position of a frame relative to the last frame.
-    """
-    change = estimate.positions - first.positions
-    change = change - change[-1]
-    largest = float(np.sqrt(np.max(np.sum(change**2, axis=1))))
-    if largest == 0.0:
-        return 0.0
-    away = estimate.points - estimate.positions[-1]
-    return largest / float(np.sqrt(np.median(np.sum(away**2, axis=1))))
 
 
 def _are_same(some: tuple[object, ...], others: tuple[object, ...]) -> bool:

@@ -21,6 +21,9 @@ from slam_graph.backend.window import Window
 from slam_graph.geometry import NavState
 from slam_graph.sensors import ImuData
 
+_LEAST_FORCE = 1.0
+"""m/s²: a specific force at rest that is smaller is not that of gravity, and levels nothing."""
+
 
 def state_at_rest(samples: ImuData, stamp_ns: int, prior: PriorConfig) -> NavState:
     """The state of a platform that stood still while the samples were taken.
@@ -56,7 +59,7 @@ def _covariance_at_rest(force: FloatArray, prior: PriorConfig) -> FloatArray:
         prior: standard deviations; that of the attitude is what the bias does not explain.
     """
     root = np.eye(15)
-    root[:3, 9:12] = skew(force) / (force @ force)  # u / g
+    root[:3, 9:12] = skew(force) / max(float(force @ force), _LEAST_FORCE**2)  # u / g
     return np.asarray(root @ prior_covariance(prior) @ root.T)
 
 
