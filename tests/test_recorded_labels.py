@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Recordings of tracks with labels of masks, and with features that move: files, replay, runs."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -111,6 +112,37 @@ def test_nonsense_in_files_is_refused(recorded: Path, name: str) -> None:
         list(TrackRecordingSequence(recorded).frames())
 
 
+@pytest.mark.parametrize("label", [-1, 65536, 70000, 2**32 + 5])
+@pytest.mark.parametrize("moves", [False, True])
+def test_labels_that_no_mask_can_have_are_not_recorded(
+    tmp_path: Path, label: int, moves: bool
+) -> None:
+    wrong, other = seen(0, [0, label, 1]), seen(0, None)
+    frame = FeatureFrame(100, (seen(0, [0, 0, 0]) if moves else wrong, other))
+    if moves:
+        frame = replace(frame, moving=(wrong, other))
+    with (
+        pytest.raises(DataError, match=f"label {label} "),
+        TrackRecorder(tmp_path / "wrong", euroc_rig()) as recorder,
+    ):
+        recorder.write(ImuData.empty(), frame)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("cameras", [1, 3])
+def test_features_that_move_in_other_cameras_are_not_recorded(tmp_path: Path, cameras: int) -> None:
+    """The frames before are kept if the caller goes on."""
+    good, other = frames()[2], seen(0, None)
+    bad = FeatureFrame(400, (other, other), moving=(other,) * cameras)
+    with TrackRecorder(tmp_path / "kept", euroc_rig()) as recorder:
+        recorder.write(ImuData.empty(), good)
+        with pytest.raises(DataError, match=f"in {cameras} cameras"):
+            recorder.write(ImuData.empty(), bad)
+    (read,) = TrackRecordingSequence(tmp_path / "kept").frames()
+    assert isinstance(read, FeatureFrame)
+    assert [len(part) for part in read.moving] == [3, 2]
+
+
 def test_what_moves_is_replayed_only_where_it_is_wanted() -> None:
     frame = frames()[-1]
     for wanted in (True, False):
@@ -205,6 +237,23 @@ def test_the_front_end_alone_records_labels(tmp_path: Path) -> None:
     for frame in TrackRecordingSequence(tracks).frames():
         assert isinstance(frame, FeatureFrame)
         assert frame.cameras[0].labels is not None
+
+
+def test_masks_are_not_read_where_nothing_is_recorded(tmp_path: Path) -> None:
+    sequence = simulate(
+        kind="images", duration_s=0.5, rate_hz=10.0, objects={"count": 1, "masks": True}
+    )
+    sequence.save(tmp_path / "flight")
+    masks = tmp_path / "masks"
+    masks.mkdir()
+    (masks / "boxes.csv").write_text("100,nonsense,0,0,1,1\n" * 2)
+    picture = str(tmp_path / "tracks.png")
+    arguments = ["frontend", str(tmp_path / "flight"), "--source", f"masks={masks}"]
+    done = CliRunner().invoke(app, [*arguments, "--picture", picture], catch_exceptions=False)
+    assert done.exit_code == 0, done.output
+    arguments += ["--record", str(tmp_path / "tracks")]
+    done = CliRunner().invoke(app, [*arguments, "--picture", picture])
+    assert done.exit_code != 0
 
 
 def test_simulated_labels_are_those_of_the_first_camera() -> None:

@@ -170,10 +170,10 @@ def _watch(
     from slam_graph.sensors import CameraFrame
     from slam_graph.visualization import TrackPictures
 
-    recorder = None
+    recorder = labels = None
     info = sequence.info()
-    labels = LabelsOverTime(sequence) if sequence.masks else None
     if record is not None:
+        labels = LabelsOverTime(sequence) if sequence.masks else None
         truth, notes = sequence.groundtruth(), classes_text(sequence.mask_classes)
         recorder = stack.enter_context(
             TrackRecorder(record, sequence.rig, info.name, truth, notes=notes)

@@ -143,7 +143,7 @@ class RecordedObjects:
         """Labels of one frame; None if it has no mask."""
         if len(labels) and np.all(labels == _NO_MASK):
             return None
-        if np.any((labels < 0) | (labels > LARGEST_LABEL)):
+        if unknown_labels(labels).size:
             raise DataError(f"{self._folder / name}: a label is not 0 to {LARGEST_LABEL}; {_AGAIN}")
         return labels
 
@@ -158,6 +158,13 @@ class RecordedObjects:
         if size != expected:
             found = "missing" if size < 0 else f"{size} bytes long"
             raise DataError(f"{file}: {found}, it should have {expected} bytes; {_AGAIN}")
+
+
+def unknown_labels(labels: IntArray | None) -> IntArray:
+    """Those of the labels (N,) of a frame that no mask can have; none if it has no mask."""
+    if labels is None:
+        return np.zeros(0, np.int64)
+    return np.asarray(labels[(labels < 0) | (labels > LARGEST_LABEL)])
 
 
 def _labels(labels: IntArray | None, count: int) -> NDArray[np.int32]:
