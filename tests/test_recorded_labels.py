@@ -11,10 +11,12 @@ import yaml
 from typer.testing import CliRunner
 
 from slam_graph.cli.main import app
+from slam_graph.config import load_config
 from slam_graph.datasets import TrackRecorder, open_dataset
 from slam_graph.datasets.formats.track_recording import TrackRecordingSequence
 from slam_graph.datasets.streams.mask_images import classes_text
 from slam_graph.errors import DataError
+from slam_graph.experiment.tasks import RecordTask, find_sources
 from slam_graph.frontend import FrontendConfig, build_frontend
 from slam_graph.pipeline import run
 from slam_graph.results import RunResult
@@ -237,6 +239,46 @@ def test_the_front_end_alone_records_labels(tmp_path: Path) -> None:
     for frame in TrackRecordingSequence(tracks).frames():
         assert isinstance(frame, FeatureFrame)
         assert frame.cameras[0].labels is not None
+
+
+def test_a_comparison_records_labels_and_what_moves(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of a folder of masks that is named, from a relative path; it is told when it has changed."""
+    sequence = simulate(
+        kind="images", duration_s=0.5, rate_hz=10.0, objects={"count": 1, "masks": True}
+    )
+    sequence.save(tmp_path / "flight")
+    (masks,) = (tmp_path / "flight").rglob("masks")
+    masks = masks.rename(tmp_path / "named")
+    (masks / "classes.csv").write_text("1,box\n")
+    monkeypatch.chdir(tmp_path)
+
+    def task(objects: bool, sensors: dict[str, str]) -> RecordTask:
+        (source,) = find_sources([tmp_path / "flight"], None, (), None, sensors)
+        config = load_config(overrides=[f"objects.enabled={str(objects).lower()}"])
+        return RecordTask(source=source, seed=0, config=config, root=tmp_path / "tracks")
+
+    wanted = task(True, {"masks": "named"})
+    assert wanted.source.sources == {"masks": str(masks)}
+    wanted.do()
+    replay = TrackRecordingSequence(wanted.folder)
+    assert replay.mask_classes == {1: "box"}
+    for frame in replay.frames():
+        assert isinstance(frame, FeatureFrame)
+        assert frame.cameras[0].labels is not None
+    assert wanted.folder == task(True, {"masks": "named"}).folder
+    (masks / "classes.csv").write_text("1,another box\n")
+    others = [task(True, {"masks": "named"}), task(True, {}), task(False, {"masks": "named"})]
+    assert len({wanted.folder, *(other.folder for other in others)}) == 4
+    others[2].do()
+    assert not (others[2].folder / "labels.bin").exists()
+
+
+def test_a_source_without_named_sensors_is_told_apart_as_before() -> None:
+    (source,) = find_sources(["sim:figure8"], 1.0)
+    assert not {"sources", "written"} & source.identity().keys()
+    assert {"name", "recording", "simulation", "extent"} <= source.identity().keys()
 
 
 def test_masks_are_not_read_where_nothing_is_recorded(tmp_path: Path) -> None:
