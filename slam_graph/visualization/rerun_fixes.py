@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from slam_graph.arrays import BoolArray, FloatArray, IntArray
 from slam_graph.backend import Estimator
+from slam_graph.backend.aiding.fix_factors import on_the_clock
 from slam_graph.sensors import AidingData
 from slam_graph.visualization.rerun_palette import AXES, ORANGE, VERMILLION
 from slam_graph.visualization.rerun_progress import ShownFrame
@@ -159,11 +160,7 @@ class FixViews:
     def _take(self, data: AidingData | None, estimator: Estimator) -> None:
         """Note what was measured up to the last frame that was solved, and what was rejected."""
         if data is not None:
-            config = estimator.config
-            offsets = config.gnss.time_offset_s, config.known_poses.time_offset_s
-            later = _without_odometry(data).shifted(*(round(offset * 1e9) for offset in offsets))
-            later = later if config.gnss.enabled else later.without_fixes()
-            later = later if config.known_poses.enabled else later.without_poses()
+            later = on_the_clock(data.without_odometry(), estimator.config)
             self._waiting = AidingData.concatenate([self._waiting, later])
         due = self._waiting.within(None, estimator.solved_ns)
         self._waiting = self._waiting.within(estimator.solved_ns, None)
@@ -184,10 +181,3 @@ class FixViews:
         tested, rejected = counts - self._counts.get(source, np.zeros(2, np.int64))
         self._counts[source] = counts
         return bool(tested == rejected == count)
-
-
-def _without_odometry(data: AidingData) -> AidingData:
-    none = AidingData.empty()
-    return data.with_odometry(
-        none.odometry_stamps_ns, none.odometry_positions, none.odometry_quaternions
-    )

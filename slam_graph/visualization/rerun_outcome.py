@@ -13,6 +13,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from slam_graph.arrays import FloatArray, IntArray
+from slam_graph.config import RunConfig
 from slam_graph.errors import DataError
 from slam_graph.evaluation import mean_bounds, synchronize
 from slam_graph.geometry import AlignmentMode, Similarity, Trajectory
@@ -68,6 +69,11 @@ lines: their residuals, ten times as long.
 
 class FinishedRun(Protocol):
     """What is known at the end of a run: `RunResult`, or `SavedRun`."""
+
+    @property
+    def config(self) -> RunConfig:
+        """Its settings."""
+        ...
 
     @property
     def trajectory(self) -> Trajectory:
