@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from slam_graph.datasets.calibration.kalibr_calibration import write_kalibr
 from slam_graph.datasets.formats import track_recording as layout
+from slam_graph.datasets.formats.recorded_files import packed
 from slam_graph.datasets.formats.recorded_objects import ObjectColumns, unknown_labels
 from slam_graph.datasets.formats.recorded_states import save_state, save_trajectory
 from slam_graph.datasets.streams.aiding_files import aiding_texts
@@ -160,7 +161,7 @@ class TrackRecorder:
         row["stamp"], row["counts"] = frame.stamp_ns, [len(seen) for seen in frame.cameras]
         self._frames.write(row.tobytes())
         for seen in frame.cameras:
-            self._features.write(_pack(seen).tobytes())
+            self._features.write(packed(seen, layout.FEATURE_RECORD).tobytes())
         if self._depth_camera is not None:
             self._depths.write(_pack_depth(frame.cameras[self._depth_camera]).tobytes())
         self._objects.write(frame)
@@ -217,12 +218,6 @@ class TrackRecorder:
             (self._folder / name).write_text(text, encoding="utf-8")
         self._folder.chmod(0o755)
         self._folder.rename(self.path)
-
-
-def _pack(seen: FeatureObservations) -> NDArray[np.void]:
-    rows = np.empty(len(seen), layout.FEATURE_RECORD)
-    rows["id"], rows["pixel"], rows["normalized"] = seen.ids, seen.pixels, seen.normalized
-    return rows
 
 
 def _pack_depth(seen: FeatureObservations) -> NDArray[np.void]:
