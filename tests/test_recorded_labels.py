@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Recordings of tracks with labels of masks, and with features that move: files, replay, runs."""
 
+import errno
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,6 +14,7 @@ from typer.testing import CliRunner
 from slam_graph.cli.main import app
 from slam_graph.config import load_config
 from slam_graph.datasets import TrackRecorder, open_dataset
+from slam_graph.datasets.formats.recorded_objects import ObjectColumns
 from slam_graph.datasets.formats.track_recording import TrackRecordingSequence
 from slam_graph.datasets.streams.mask_images import classes_text
 from slam_graph.errors import DataError
@@ -143,6 +145,28 @@ def test_features_that_move_in_other_cameras_are_not_recorded(tmp_path: Path, ca
     (read,) = TrackRecordingSequence(tmp_path / "kept").frames()
     assert isinstance(read, FeatureFrame)
     assert [len(part) for part in read.moving] == [3, 2]
+
+
+def test_files_are_closed_where_the_end_cannot_be_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(columns: ObjectColumns) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    opened = []
+    own = TrackRecorder._open
+    monkeypatch.setattr(
+        TrackRecorder, "_open", lambda self, name: opened.append(own(self, name)) or opened[-1]
+    )
+    monkeypatch.setattr(ObjectColumns, "finish", full)
+    with (
+        pytest.raises(DataError, match="No space left"),
+        TrackRecorder(tmp_path / "full", euroc_rig()) as recorder,
+    ):
+        recorder.write(ImuData.empty(), frames()[1])
+    assert len(opened) == 4
+    assert all(file.closed for file in opened)
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_what_moves_is_replayed_only_where_it_is_wanted() -> None:
