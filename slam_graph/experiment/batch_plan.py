@@ -19,7 +19,6 @@ from pydantic import Field
 
 from slam_graph.config import load_config
 from slam_graph.datasets import DATASETS
-from slam_graph.datasets.streams.mask_images import MASKS
 from slam_graph.errors import ConfigError, DataError
 from slam_graph.experiment.batch_task import BatchTask
 from slam_graph.experiment.settings_hash import settings_hash
@@ -27,6 +26,9 @@ from slam_graph.results import ResultFolder
 from slam_graph.settings import ConfigTree, Settings
 
 logger = logging.getLogger(__name__)
+
+FOLDER_OF_MASKS = "masks"
+"""The source that is a folder."""
 
 _DEMO = "demo"
 _LISTS = (".yaml", ".yml")
@@ -122,7 +124,7 @@ def plan(
         files += [
             path
             for sensor, path in entry.sources.items()
-            if sensor == MASKS or Path(path).is_file()
+            if sensor == FOLDER_OF_MASKS or Path(path).is_file()
         ]
         tasks.append(
             BatchTask(
@@ -189,7 +191,7 @@ def _is_path(sensor: str, path: Path) -> bool:
 
     No topic has a suffix.
     """
-    return sensor == MASKS or (sensor != "rate" and (path.is_file() or path.suffix != ""))
+    return sensor == FOLDER_OF_MASKS or (sensor != "rate" and (path.is_file() or path.suffix != ""))
 
 
 def size_and_time(path: Path) -> tuple[int, int] | None:

@@ -21,11 +21,9 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, TypeAdapter
 
 from slam_graph.config import RunConfig
-from slam_graph.datasets import Sequence, TrackRecorder, open_dataset
-from slam_graph.datasets.object_sources import LabelsOverTime, ObjectSources
-from slam_graph.datasets.streams.mask_images import MASKS, classes_text
+from slam_graph.datasets import RecordedSequence, Sequence, TrackRecorder, open_dataset
 from slam_graph.errors import ConfigError, DataError, closest
-from slam_graph.experiment.batch_plan import absolute_sources, size_and_time
+from slam_graph.experiment.batch_plan import FOLDER_OF_MASKS, absolute_sources, size_and_time
 from slam_graph.experiment.batch_task import BatchTask
 from slam_graph.experiment.comparison_results import read_result, write_result
 from slam_graph.experiment.settings_hash import settings_hash
@@ -129,7 +127,7 @@ def _recorded(path: str, groundtruth: str | None, sensors: Mapping[str, str]) ->
     files = {
         name: size_and_time(Path(where))
         for name, where in places.items()
-        if name == MASKS or Path(where).is_file()
+        if name == FOLDER_OF_MASKS or Path(where).is_file()
     }
     where = str(Path(path).resolve()) if Path(path).exists() else path
     return Source(
@@ -230,9 +228,8 @@ class RecordTask(Settings):
         )
         truth, start = sequence.groundtruth(), sequence.initial_state()
         labels, notes = None, {}
-        if objects and isinstance(sequence, ObjectSources):
-            labels = LabelsOverTime(sequence) if sequence.masks else None
-            notes = classes_text(sequence.mask_classes)
+        if objects and isinstance(sequence, RecordedSequence):
+            labels, notes = sequence.labels_over_time(), sequence.classes_file()
         with TrackRecorder(
             self.folder, sequence.rig, self.source.name, truth, start, notes
         ) as recorder:

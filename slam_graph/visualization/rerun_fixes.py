@@ -12,7 +12,6 @@ from scipy.spatial.transform import Rotation
 
 from slam_graph.arrays import BoolArray, FloatArray, IntArray
 from slam_graph.backend import Estimator
-from slam_graph.backend.aiding.fix_factors import on_the_clock
 from slam_graph.sensors import AidingData
 from slam_graph.visualization.rerun_palette import AXES, ORANGE, VERMILLION
 from slam_graph.visualization.rerun_progress import ShownFrame
@@ -160,7 +159,7 @@ class FixViews:
     def _take(self, data: AidingData | None, estimator: Estimator) -> None:
         """Note what was measured up to the last frame that was solved, and what was rejected."""
         if data is not None:
-            later = on_the_clock(data.without_odometry(), estimator.config)
+            later = estimator.config.on_the_clock(data.without_odometry())
             self._waiting = AidingData.concatenate([self._waiting, later])
         due = self._waiting.within(None, estimator.solved_ns)
         self._waiting = self._waiting.within(estimator.solved_ns, None)

@@ -11,8 +11,7 @@ from typing import Any
 import numpy as np
 
 from slam_graph.arrays import FloatArray, IntArray
-from slam_graph.backend.aiding.fix_factors import on_the_clock
-from slam_graph.backend.backend_config import BackendConfig
+from slam_graph.backend import BackendConfig
 from slam_graph.datasets import Sequence
 from slam_graph.errors import DataError
 from slam_graph.maps import SlamMap
@@ -257,7 +256,7 @@ class _Inputs:
 
     def _show_aiding(self, data: AidingData, config: BackendConfig, until_ns: int) -> None:
         """Log the fixes and known poses that were used up to a frame."""
-        later = on_the_clock(data.without_odometry(), config)
+        later = config.on_the_clock(data.without_odometry())
         waiting = AidingData.concatenate([self._waiting, later])
         due, self._waiting = waiting.within(None, until_ns), waiting.within(until_ns, None)
         # files do not say which were rejected
