@@ -2,6 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Recordings of tracks with labels of masks, and with features that move: files, replay, runs."""
 
+import errno
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,10 +12,13 @@ import yaml
 from typer.testing import CliRunner
 
 from slam_graph.cli.main import app
+from slam_graph.config import load_config
 from slam_graph.datasets import TrackRecorder, open_dataset
+from slam_graph.datasets.formats.recorded_objects import ObjectColumns
 from slam_graph.datasets.formats.track_recording import TrackRecordingSequence
 from slam_graph.datasets.streams.mask_images import classes_text
 from slam_graph.errors import DataError
+from slam_graph.experiment.tasks import RecordTask, find_sources
 from slam_graph.frontend import FrontendConfig, build_frontend
 from slam_graph.pipeline import run
 from slam_graph.results import RunResult
@@ -111,6 +116,59 @@ def test_nonsense_in_files_is_refused(recorded: Path, name: str) -> None:
         list(TrackRecordingSequence(recorded).frames())
 
 
+@pytest.mark.parametrize("label", [-1, 65536, 70000, 2**32 + 5])
+@pytest.mark.parametrize("moves", [False, True])
+def test_labels_that_no_mask_can_have_are_not_recorded(
+    tmp_path: Path, label: int, moves: bool
+) -> None:
+    wrong, other = seen(0, [0, label, 1]), seen(0, None)
+    frame = FeatureFrame(100, (seen(0, [0, 0, 0]) if moves else wrong, other))
+    if moves:
+        frame = replace(frame, moving=(wrong, other))
+    with (
+        pytest.raises(DataError, match=f"label {label} "),
+        TrackRecorder(tmp_path / "wrong", euroc_rig()) as recorder,
+    ):
+        recorder.write(ImuData.empty(), frame)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("cameras", [1, 3])
+def test_features_that_move_in_other_cameras_are_not_recorded(tmp_path: Path, cameras: int) -> None:
+    """The frames before are kept if the caller goes on."""
+    good, other = frames()[2], seen(0, None)
+    bad = FeatureFrame(400, (other, other), moving=(other,) * cameras)
+    with TrackRecorder(tmp_path / "kept", euroc_rig()) as recorder:
+        recorder.write(ImuData.empty(), good)
+        with pytest.raises(DataError, match=f"in {cameras} cameras"):
+            recorder.write(ImuData.empty(), bad)
+    (read,) = TrackRecordingSequence(tmp_path / "kept").frames()
+    assert isinstance(read, FeatureFrame)
+    assert [len(part) for part in read.moving] == [3, 2]
+
+
+def test_files_are_closed_where_the_end_cannot_be_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(columns: ObjectColumns) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    opened = []
+    own = TrackRecorder._open
+    monkeypatch.setattr(
+        TrackRecorder, "_open", lambda self, name: opened.append(own(self, name)) or opened[-1]
+    )
+    monkeypatch.setattr(ObjectColumns, "finish", full)
+    with (
+        pytest.raises(DataError, match="No space left"),
+        TrackRecorder(tmp_path / "full", euroc_rig()) as recorder,
+    ):
+        recorder.write(ImuData.empty(), frames()[1])
+    assert len(opened) == 4
+    assert all(file.closed for file in opened)
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_what_moves_is_replayed_only_where_it_is_wanted() -> None:
     frame = frames()[-1]
     for wanted in (True, False):
@@ -205,6 +263,63 @@ def test_the_front_end_alone_records_labels(tmp_path: Path) -> None:
     for frame in TrackRecordingSequence(tracks).frames():
         assert isinstance(frame, FeatureFrame)
         assert frame.cameras[0].labels is not None
+
+
+def test_a_comparison_records_labels_and_what_moves(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of a folder of masks that is named, from a relative path; it is told when it has changed."""
+    sequence = simulate(
+        kind="images", duration_s=0.5, rate_hz=10.0, objects={"count": 1, "masks": True}
+    )
+    sequence.save(tmp_path / "flight")
+    (masks,) = (tmp_path / "flight").rglob("masks")
+    masks = masks.rename(tmp_path / "named")
+    (masks / "classes.csv").write_text("1,box\n")
+    monkeypatch.chdir(tmp_path)
+
+    def task(objects: bool, sensors: dict[str, str]) -> RecordTask:
+        (source,) = find_sources([tmp_path / "flight"], None, (), None, sensors)
+        config = load_config(overrides=[f"objects.enabled={str(objects).lower()}"])
+        return RecordTask(source=source, seed=0, config=config, root=tmp_path / "tracks")
+
+    wanted = task(True, {"masks": "named"})
+    assert wanted.source.sources == {"masks": str(masks)}
+    wanted.do()
+    replay = TrackRecordingSequence(wanted.folder)
+    assert replay.mask_classes == {1: "box"}
+    for frame in replay.frames():
+        assert isinstance(frame, FeatureFrame)
+        assert frame.cameras[0].labels is not None
+    assert wanted.folder == task(True, {"masks": "named"}).folder
+    (masks / "classes.csv").write_text("1,another box\n")
+    others = [task(True, {"masks": "named"}), task(True, {}), task(False, {"masks": "named"})]
+    assert len({wanted.folder, *(other.folder for other in others)}) == 4
+    others[2].do()
+    assert not (others[2].folder / "labels.bin").exists()
+
+
+def test_a_source_without_named_sensors_is_told_apart_as_before() -> None:
+    (source,) = find_sources(["sim:figure8"], 1.0)
+    assert not {"sources", "written"} & source.identity().keys()
+    assert {"name", "recording", "simulation", "extent"} <= source.identity().keys()
+
+
+def test_masks_are_not_read_where_nothing_is_recorded(tmp_path: Path) -> None:
+    sequence = simulate(
+        kind="images", duration_s=0.5, rate_hz=10.0, objects={"count": 1, "masks": True}
+    )
+    sequence.save(tmp_path / "flight")
+    masks = tmp_path / "masks"
+    masks.mkdir()
+    (masks / "boxes.csv").write_text("100,nonsense,0,0,1,1\n" * 2)
+    picture = str(tmp_path / "tracks.png")
+    arguments = ["frontend", str(tmp_path / "flight"), "--source", f"masks={masks}"]
+    done = CliRunner().invoke(app, [*arguments, "--picture", picture], catch_exceptions=False)
+    assert done.exit_code == 0, done.output
+    arguments += ["--record", str(tmp_path / "tracks")]
+    done = CliRunner().invoke(app, [*arguments, "--picture", picture])
+    assert done.exit_code != 0
 
 
 def test_simulated_labels_are_those_of_the_first_camera() -> None:

@@ -166,6 +166,26 @@ def test_known_poses_of_a_run_are_shown_in_their_world(tmp_path: Path) -> None:
     assert not any(name.endswith(f"/{FIXES}") for name in rows)
 
 
+def test_a_saved_run_shows_only_what_it_used(tmp_path: Path) -> None:
+    """Like the run that is watched: no fixes where they are not used."""
+    flight = sg.simulate(
+        duration_s=8.0,
+        tracks={"features": 60},
+        gnss={},
+        known_poses={"position_sigma_m": 0.02, "rate_hz": 2.0},
+    )
+    off = {"backend.gnss.enabled": False, "final_ba.enabled": False}
+    result = sg.run(flight, overrides=off)
+    assert result.metrics["world"]["of_fixes"]
+    with RerunRecording("save", "used", tmp_path / "used.rrd") as recording:
+        recording.show_run(
+            result, np.zeros((0, 3)), {}, rig=result.causal_rig, recording=flight, images=False
+        )
+    names = {name.split("/")[-1] for name in rows_of(tmp_path / "used.rrd")}
+    assert POSES in names
+    assert FIXES not in names
+
+
 def test_axes_and_ellipsoids_of_known_poses_are_what_was_measured(tmp_path: Path) -> None:
     rng = np.random.default_rng(4)
     sigmas = rng.uniform(0.01, 0.1, (6, 6))

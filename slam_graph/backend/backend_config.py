@@ -5,12 +5,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import ClassVar, Literal
+from typing import TYPE_CHECKING, ClassVar, Literal
 
 from pydantic import Field
 
 from slam_graph.errors import ConfigError
 from slam_graph.settings import Settings, expert
+
+if TYPE_CHECKING:
+    from slam_graph.sensors import AidingData
 
 
 class AdaptiveNoiseConfig(Settings):
@@ -341,3 +344,12 @@ class BackendConfig(Settings):
     """Start-up."""
     calibration: CalibrationConfig = CalibrationConfig()
     """Online calibration."""
+
+    def on_the_clock(self, data: AidingData) -> AidingData:
+        """Fixes and known poses that are used, with the time offsets of their sources added."""
+        if not self.gnss.enabled:
+            data = data.without_fixes()
+        if not self.known_poses.enabled:
+            data = data.without_poses()
+        offsets = self.gnss.time_offset_s, self.known_poses.time_offset_s
+        return data.shifted(*(round(offset * 1e9) for offset in offsets))

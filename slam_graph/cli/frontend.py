@@ -165,16 +165,14 @@ def _watch(
 ) -> Callable[[Packet, FeatureFrame], None]:
     """A function that draws each frame, and records it if asked for."""
     from slam_graph.datasets import TrackRecorder
-    from slam_graph.datasets.object_sources import LabelsOverTime
-    from slam_graph.datasets.streams.mask_images import classes_text
     from slam_graph.sensors import CameraFrame
     from slam_graph.visualization import TrackPictures
 
-    recorder = None
+    recorder = labels = None
     info = sequence.info()
-    labels = LabelsOverTime(sequence) if sequence.masks else None
     if record is not None:
-        truth, notes = sequence.groundtruth(), classes_text(sequence.mask_classes)
+        labels = sequence.labels_over_time()
+        truth, notes = sequence.groundtruth(), sequence.classes_file()
         recorder = stack.enter_context(
             TrackRecorder(record, sequence.rig, info.name, truth, notes=notes)
         )

@@ -12,7 +12,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from slam_graph.datasets.streams.mask_images import MASKS, LabelImage, MaskFolder, sampled
+from slam_graph.datasets.streams.mask_images import (
+    MASKS,
+    LabelImage,
+    MaskFolder,
+    classes_text,
+    sampled,
+)
 from slam_graph.datasets.streams.object_truth import (
     OBJECT_TRUTH,
     object_truth_file,
@@ -64,6 +70,18 @@ class ObjectSources:
     def mask_classes(self) -> dict[int, str]:
         """Name of the class by label."""
         return {} if self._mask_folder is None else self._mask_folder.classes
+
+    def classes_file(self) -> dict[str, str]:
+        """Name and text of a file with these classes; empty without any."""
+        return classes_text(self.mask_classes)
+
+    def labels_over_time(self) -> LabelsOverTime | None:
+        """What gives tracks the labels of the masks, frame by frame; None without masks.
+
+        Raises:
+            DataError: if the masks cannot be read.
+        """
+        return LabelsOverTime(self) if self.masks else None
 
     def label_image(self, stamp_ns: int) -> LabelImage | None:
         """The label image (height, width) of the first camera in a frame; None without one.

@@ -27,6 +27,9 @@ from slam_graph.settings import ConfigTree, Settings
 
 logger = logging.getLogger(__name__)
 
+FOLDER_OF_MASKS = "masks"
+"""The source that is a folder."""
+
 _DEMO = "demo"
 _LISTS = (".yaml", ".yml")
 _IMAGES = {".png", ".jpg", ".jpeg", ".pgm", ".bmp", ".tif", ".tiff", ".webp"}
@@ -118,7 +121,11 @@ def plan(
             raise ConfigError(f"{one.origin}: {error}" if one.origin else str(error)) from error
         entry = one.entry
         files = [path for path in (entry.calibration, entry.groundtruth) if path is not None]
-        files += [path for path in entry.sources.values() if Path(path).is_file()]
+        files += [
+            path
+            for sensor, path in entry.sources.items()
+            if sensor == FOLDER_OF_MASKS or Path(path).is_file()
+        ]
         tasks.append(
             BatchTask(
                 name=name,
@@ -167,21 +174,33 @@ def _absolute(text: str, folder: Path) -> str:
 
 
 def absolute_sources(sources: Mapping[str, str], folder: Path) -> dict[str, str]:
-    """Where sensors are, with absolute paths of files; topics and rates stay as they are.
+    """Where sensors are, with absolute paths; topics and rates stay as they are.
 
     Args:
         sources: by the names of sensors.
         folder: that paths are relative to.
     """
     return {
-        sensor: str(folder / where) if _is_file(sensor, folder / where) else where
+        sensor: str(folder / where) if _is_path(sensor, folder / where) else where
         for sensor, where in sources.items()
     }
 
 
-def _is_file(sensor: str, path: Path) -> bool:
-    """Whether a source is a file, which may be missing: no topic has a suffix."""
-    return sensor != "rate" and (path.is_file() or path.suffix != "")
+def _is_path(sensor: str, path: Path) -> bool:
+    """Whether a source is a file or the folder of masks, which may be missing.
+
+    No topic has a suffix.
+    """
+    return sensor == FOLDER_OF_MASKS or (sensor != "rate" and (path.is_file() or path.suffix != ""))
+
+
+def size_and_time(path: Path) -> tuple[int, int] | None:
+    """Size and time of the last change (ns) of a file or of all below a folder; None without it."""
+    if not path.exists():
+        return None
+    files = [file.stat() for file in _files(path)]
+    times = [file.st_mtime_ns for file in (*files, path.stat())]
+    return sum(file.st_size for file in files), max(times)
 
 
 def _with_paths(settings: dict[str, Any], folder: Path) -> dict[str, Any]:

@@ -16,14 +16,14 @@ import stat
 import sys
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import Field, TypeAdapter
 
 from slam_graph.config import RunConfig
-from slam_graph.datasets import Sequence, TrackRecorder, open_dataset
+from slam_graph.datasets import RecordedSequence, Sequence, TrackRecorder, open_dataset
 from slam_graph.errors import ConfigError, DataError, closest
-from slam_graph.experiment.batch_plan import absolute_sources
+from slam_graph.experiment.batch_plan import FOLDER_OF_MASKS, absolute_sources, size_and_time
 from slam_graph.experiment.batch_task import BatchTask
 from slam_graph.experiment.comparison_results import read_result, write_result
 from slam_graph.experiment.settings_hash import settings_hash
@@ -56,7 +56,7 @@ class Source(Settings):
     sources: dict[str, str] = Field(default_factory=dict)
     """Where sensors of a recording are that are not found by themselves, such as fixes."""
     written: dict[str, tuple[int, int]] = Field(default_factory=dict)
-    """Size and time of those of them that are files, for the same reason."""
+    """Size and time of those of them that are files or folders, for the same reason."""
 
     def open(self, seed: int, cameras: int | None) -> Sequence:
         """The sequence; of a simulation, that with the given seed.
@@ -70,6 +70,15 @@ class Source(Settings):
         truth = None if self.groundtruth is None else Path(self.groundtruth)
         sources = self.sources or None
         return open_dataset(self.recording, cameras=cameras, groundtruth=truth, sources=sources)
+
+    def identity(self) -> dict[str, Any]:
+        """What tells it from others, for a hash: places of sensors only where some were named."""
+        settings = self.model_dump(mode="json")
+        return {
+            name: value
+            for name, value in settings.items()
+            if value or name not in ("sources", "written")
+        }
 
 
 def find_sources(
@@ -115,7 +124,11 @@ def _recorded(path: str, groundtruth: str | None, sensors: Mapping[str, str]) ->
     truth = None if groundtruth is None else Path(groundtruth)
     places = absolute_sources(sensors, Path.cwd())
     info = open_dataset(path, groundtruth=truth, sources=places or None).info()
-    files = {name: Path(where).stat() for name, where in places.items() if Path(where).is_file()}
+    files = {
+        name: size_and_time(Path(where))
+        for name, where in places.items()
+        if name == FOLDER_OF_MASKS or Path(where).is_file()
+    }
     where = str(Path(path).resolve()) if Path(path).exists() else path
     return Source(
         name=_plain(info.name),
@@ -124,7 +137,7 @@ def _recorded(path: str, groundtruth: str | None, sensors: Mapping[str, str]) ->
         random=info.content == "images",
         extent=(info.frames, info.start_ns, info.end_ns),
         sources=places,
-        written={name: (file.st_size, file.st_mtime_ns) for name, file in files.items()},
+        written={name: file for name, file in files.items() if file is not None},
     )
 
 
@@ -160,7 +173,7 @@ class RecordTask(Settings):
     source: Source
     seed: int
     config: RunConfig
-    """Only front end, cameras, start and duration matter."""
+    """Only front end, cameras, start, duration and `objects.enabled` matter."""
     root: Path
     """Folder of all tracks."""
 
@@ -175,8 +188,9 @@ class RecordTask(Settings):
         config = self.config.model_dump(
             mode="json", include={"frontend", "cameras", "start_s", "duration_s"}
         )
-        source = self.source.model_dump(mode="json")
-        key = settings_hash(source, config, self.seed, __version__)
+        if self.config.objects.enabled:
+            config["objects"] = True
+        key = settings_hash(self.source.identity(), config, self.seed, __version__)
         return self.root / f"{self.source.name}_seed{self.seed}_{key}"
 
     def is_done(self) -> bool:
@@ -188,7 +202,13 @@ class RecordTask(Settings):
         return True
 
     def do(self) -> None:
-        """Record the tracks, in the place of a recording that is damaged."""
+        """Record the tracks, in the place of a recording that is damaged.
+
+        Where objects are estimated, what moves and the labels of masks are recorded too.
+
+        Raises:
+            DataError: if the source cannot be read, or the recording not be written.
+        """
         shutil.rmtree(self.folder, ignore_errors=True)
         config = self.config
         sequence = self.source.open(self.seed, config.cameras)
@@ -196,18 +216,26 @@ class RecordTask(Settings):
         start_ns = info.start_ns + round(config.start_s * 1e9)
         length_s = config.duration_s
         end_ns = None if length_s is None else start_ns + round(length_s * 1e9)
+        objects = config.objects.enabled
+        moving = config.frontend.keep_moving or objects
         frontend = build_frontend(
             sequence.rig,
-            config.frontend,
+            config.frontend.model_copy(update={"keep_moving": moving}),
             self.seed,
             sequence.diagnostics,
             info.content,
             config.backend.noise.gravity,
         )
         truth, start = sequence.groundtruth(), sequence.initial_state()
-        with TrackRecorder(self.folder, sequence.rig, self.source.name, truth, start) as recorder:
+        labels, notes = None, {}
+        if objects and isinstance(sequence, RecordedSequence):
+            labels, notes = sequence.labels_over_time(), sequence.classes_file()
+        with TrackRecorder(
+            self.folder, sequence.rig, self.source.name, truth, start, notes
+        ) as recorder:
             for packet in sequence.packets(start_ns if config.start_s > 0 else None, end_ns):
                 features = frontend.track(packet.frame, packet.imu)
+                features = features if labels is None else labels.labelled(features)
                 recorder.write(packet.imu, features, packet.aiding)
 
 

@@ -1,6 +1,13 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""Gauss-Newton steps for the position and the velocity of many tracks, each with poses as given."""
+"""Gauss-Newton steps for the position and the velocity of many tracks, each with poses as given.
+
+Beside the noise of single observations a track has three slow errors, which last over its frames: a
+constant offset of its matches in the other cameras (pixels), and the rates at which its patch
+slides off its point in the first camera and in the others (pixels/s). Each has two pixel
+coordinates with a Gaussian prior, and is estimated with the point. The shares of an observation
+say by how much it changes with each of the three.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +23,7 @@ _SIZE = 12
 _ENTRIES = 9
 """Of them in a row: it has one coordinate of the slow errors only."""
 _LOST = 1e-12
-"""Takes the place of a pivot that rounding has made zero, as it loses a prior beside 1e20."""
+"""Used as pivot where rounding gives zero: beside 1e20 the prior's share is lost."""
 
 
 @compiled()
@@ -70,7 +77,8 @@ def motion_steps(
         residuals: (N, 2) over σ, without the slow errors.
         shares: (N, 3) derivatives of each pixel coordinate by its three slow errors, over σ.
         since: (N,) times t, s: the point of an observation is p + t u.
-        starts: (J + 1,) first observation of each track, and N.
+        starts: (J + 1,) first observation of each track, and N; strictly ascending, as each track
+            has at least one observation.
         x: (J, 12) p, u, and the slow errors (two coordinates of each).
         before: (J, 12) mean of the prior.
         information: (12,) of the prior, on its diagonal.

@@ -116,6 +116,13 @@ class AidingData:
             none.pose_stamps_ns, none.pose_positions, none.pose_quaternions, none.pose_sigmas
         )
 
+    def without_odometry(self) -> AidingData:
+        """The same without odometry."""
+        none = AidingData.empty()
+        return self.with_odometry(
+            none.odometry_stamps_ns, none.odometry_positions, none.odometry_quaternions
+        )
+
     def __len__(self) -> int:
         """Number of fixes, of known poses and of samples of odometry."""
         return sum(

@@ -159,11 +159,7 @@ class FixViews:
     def _take(self, data: AidingData | None, estimator: Estimator) -> None:
         """Note what was measured up to the last frame that was solved, and what was rejected."""
         if data is not None:
-            config = estimator.config
-            offsets = config.gnss.time_offset_s, config.known_poses.time_offset_s
-            later = _without_odometry(data).shifted(*(round(offset * 1e9) for offset in offsets))
-            later = later if config.gnss.enabled else later.without_fixes()
-            later = later if config.known_poses.enabled else later.without_poses()
+            later = estimator.config.on_the_clock(data.without_odometry())
             self._waiting = AidingData.concatenate([self._waiting, later])
         due = self._waiting.within(None, estimator.solved_ns)
         self._waiting = self._waiting.within(estimator.solved_ns, None)
@@ -184,10 +180,3 @@ class FixViews:
         tested, rejected = counts - self._counts.get(source, np.zeros(2, np.int64))
         self._counts[source] = counts
         return bool(tested == rejected == count)
-
-
-def _without_odometry(data: AidingData) -> AidingData:
-    none = AidingData.empty()
-    return data.with_odometry(
-        none.odometry_stamps_ns, none.odometry_positions, none.odometry_quaternions
-    )

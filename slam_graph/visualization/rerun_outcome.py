@@ -13,6 +13,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from slam_graph.arrays import FloatArray, IntArray
+from slam_graph.backend import BackendConfig
 from slam_graph.errors import DataError
 from slam_graph.evaluation import mean_bounds, synchronize
 from slam_graph.geometry import AlignmentMode, Similarity, Trajectory
@@ -66,8 +67,22 @@ lines: their residuals, ten times as long.
 """
 
 
+class RunSettings(Protocol):
+    """The part of the settings of a run that is needed here."""
+
+    @property
+    def backend(self) -> BackendConfig:
+        """Settings of the back end."""
+        ...
+
+
 class FinishedRun(Protocol):
     """What is known at the end of a run: `RunResult`, or `SavedRun`."""
+
+    @property
+    def config(self) -> RunSettings:
+        """Its settings."""
+        ...
 
     @property
     def trajectory(self) -> Trajectory:

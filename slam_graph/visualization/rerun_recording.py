@@ -119,9 +119,10 @@ class RerunRecording:
             recording: that was run, if its images or tracks and IMU samples are to be shown.
             images: whether images of the recording are shown.
         """
-        of_fixes = bool(run.metrics.get("world", {}).get("of_fixes", False))
+        of_fixes = recording is not None and run.metrics.get("world", {}).get("of_fixes", False)
+        aiding = run.config.backend if of_fixes else None
         details = SavedDetails(
-            rig, points, timing, by_frame or {}, log, known_map, recording, images, of_fixes
+            rig, points, timing, by_frame or {}, log, known_map, recording, images, aiding
         )
         show_saved_run(self._stream, run, details)
 

@@ -11,10 +11,11 @@ from typing import Any
 import numpy as np
 
 from slam_graph.arrays import FloatArray, IntArray
+from slam_graph.backend import BackendConfig
 from slam_graph.datasets import Sequence
 from slam_graph.errors import DataError
 from slam_graph.maps import SlamMap
-from slam_graph.sensors import CameraFrame, FeatureFrame, Packet, Rig
+from slam_graph.sensors import AidingData, CameraFrame, FeatureFrame, Packet, Rig
 from slam_graph.visualization.rerun_blueprints import (
     KNOWN_MAP,
     RIG_M,
@@ -53,7 +54,8 @@ class SavedDetails:
         known_map: the map that the run was located in, if it is at hand.
         recording: that was run, if its images or tracks and IMU samples are to be shown.
         images: whether images of the recording are shown.
-        of_fixes: whether the world of the run is that of position fixes.
+        aiding: settings by which the run used position fixes and known poses, if its world is
+            theirs; else they are not shown.
     """
 
     rig: Rig | None
@@ -64,7 +66,7 @@ class SavedDetails:
     known_map: SlamMap | None = None
     recording: Sequence | None = None
     images: bool = True
-    of_fixes: bool = False
+    aiding: BackendConfig | None = None
 
 
 def show_saved_run(stream: RerunStream, run: FinishedRun, details: SavedDetails) -> None:
@@ -184,9 +186,7 @@ def _show_inputs(
         DataError: if the recording has none of these frames.
     """
     assert details.recording is not None
-    inputs = _Inputs(
-        stream, series, cameras, details.recording.rig, details.images, details.of_fixes
-    )
+    inputs = _Inputs(stream, series, cameras, details.recording.rig, details.images, details.aiding)
     known, shown = set(stamps_ns.tolist()), 0
     for packet in details.recording.packets():
         if packet.frame.stamp_ns not in known:
@@ -220,7 +220,7 @@ class _Inputs:
         cameras: of the world.
         rig: of the recording.
         images: whether images and depth are sent.
-        of_fixes: whether the world is that of position fixes.
+        aiding: as for `SavedDetails`.
 
     Attributes:
         depth: where depth images go.
@@ -233,10 +233,10 @@ class _Inputs:
         cameras: CameraViews,
         rig: Rig,
         images: bool,
-        of_fixes: bool = False,
+        aiding: BackendConfig | None = None,
     ) -> None:
-        self._fixes = FixLog(stream, "world") if of_fixes else None
-        self._poses = KnownPoseLog(stream, "world")
+        self._fixes, self._poses = FixLog(stream, "world"), KnownPoseLog(stream, "world")
+        self._aiding, self._waiting = aiding, AidingData.empty()
         self._stream, self._series, self._cameras = stream, series, cameras
         self.depth, self._images = DepthView(stream, "world/body/depth", rig), images
 
@@ -249,12 +249,20 @@ class _Inputs:
             self.depth.show(packet.frame)
         elif isinstance(packet.frame, FeatureFrame):
             self._cameras.show_tracks(packet.frame, none, none)
-        if packet.aiding is not None and self._fixes is not None:
-            fixes = packet.aiding.fix_positions, packet.aiding.fix_covariances
-            self._fixes.add(*fixes, np.zeros(len(fixes[0]), np.bool_))
-            none_rejected = np.zeros(len(packet.aiding.pose_stamps_ns), np.bool_)
-            self._poses.add(packet.aiding, none_rejected)
+        if self._aiding is not None:
+            data = packet.aiding or AidingData.empty()
+            self._show_aiding(data, self._aiding, packet.frame.stamp_ns)
         add_imu(self._series, number, packet)
+
+    def _show_aiding(self, data: AidingData, config: BackendConfig, until_ns: int) -> None:
+        """Log the fixes and known poses that were used up to a frame."""
+        later = config.on_the_clock(data.without_odometry())
+        waiting = AidingData.concatenate([self._waiting, later])
+        due, self._waiting = waiting.within(None, until_ns), waiting.within(until_ns, None)
+        # files do not say which were rejected
+        fixes, poses = len(due.fix_stamps_ns), len(due.pose_stamps_ns)
+        self._fixes.add(due.fix_positions, due.fix_covariances, np.zeros(fixes, np.bool_))
+        self._poses.add(due, np.zeros(poses, np.bool_))
 
 
 def show_recording(stream: RerunStream, sequence: Sequence, images: bool = True) -> None:

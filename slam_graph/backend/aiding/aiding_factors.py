@@ -23,7 +23,6 @@ from slam_graph.backend.aiding.fix_factors import (
     FixGate,
     PositionFix,
     fixes_of,
-    on_the_clock,
     pose_between,
     pose_key,
 )
@@ -79,7 +78,7 @@ class Aiding:
     def add(self, data: AidingData) -> None:
         """Take measurements that follow those before; none say that there will be some."""
         self.used = True
-        data = on_the_clock(data, self._config).shifted(round(self.offset_s * 1e9))
+        data = self._config.on_the_clock(data).shifted(round(self.offset_s * 1e9))
         self._data = AidingData.concatenate([self._data, data])
         self._waiting = AidingData.concatenate([self._waiting, data])
 

@@ -123,16 +123,6 @@ def _noise(covariance: FloatArray, robust: bool) -> gtsam.noiseModel.Base:
     return noise
 
 
-def on_the_clock(data: AidingData, config: BackendConfig) -> AidingData:
-    """Measurements that are used, with the time offsets of their sources added."""
-    if not config.gnss.enabled:
-        data = data.without_fixes()
-    if not config.known_poses.enabled:
-        data = data.without_poses()
-    offsets = config.gnss.time_offset_s, config.known_poses.time_offset_s
-    return data.shifted(*(round(offset * 1e9) for offset in offsets))
-
-
 def fixes_of(data: AidingData, config: BackendConfig) -> list[Fix]:
     """Absolute measurements of a stretch of time: positions by the fixes, then the known poses."""
     arm = np.array(config.gnss.lever_arm_m)

@@ -41,7 +41,7 @@ where a camera sees nothing of it."""
 _MAX_SHIFT = 100.0
 """The same for the position, m."""
 _OFFSET_PX, _DRIFT_PX_S = 0.5, 1.0
-"""Standard deviations of errors that last: of a match in another camera, pixels, and of the rate at
+"""Standard deviations of slow errors: of a match in another camera, pixels, and of the rate at
 which a patch slides off its point, pixels/s. Without them such tracks seem to move slowly."""
 _CREEP = 0.05
 """Standard deviation, m/s, of the speed with which a static track may seem to move beside that."""

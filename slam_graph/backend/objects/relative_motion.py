@@ -235,7 +235,8 @@ def object_settings(backend: BackendConfig, config: ObjectsConfig) -> BackendCon
     default = BackendConfig()
     # few features, close together, do not show their noise; that of the platform's is given
     noise = {"adaptive_pixels": "never"}
-    loss = {"robust_loss": backend.gating.loss}  # said, or it would be that of no IMU
+    # given here, or the default without an IMU, Cauchy, would be taken
+    loss = {"robust_loss": backend.gating.loss}
     return backend.model_copy(
         update={
             "noise": backend.noise.model_copy(update=noise),

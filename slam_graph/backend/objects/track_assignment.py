@@ -82,7 +82,8 @@ class TrackAssignment:
     def leaving(self, item: TrackedObject) -> IntArray:
         """Ids (N,) of the tracks that are not of an object any more.
 
-        They do not fit it, have another label, or are static where the object moves.
+        They do not fit it, have another label, or are static where the object moves. `join` has to
+        be called first: it finds how well tracks fit.
         """
         fit, squares, dof = self._misfit(item, item.members)
         unfit = squares > _CLEARLY * _scale(squares, dof) * chdtri(dof, _FITS)
@@ -97,7 +98,15 @@ class TrackAssignment:
         return np.union1d(leaving, fit[static])
 
     def _misfit(self, item: TrackedObject, ids: IntArray) -> tuple[IntArray, FloatArray, IntArray]:
-        """Of some of the tracks that `join` looked at, which have all of an object among them."""
+        """How well tracks fit the motion of an object, as `join` has found.
+
+        Args:
+            item: the object.
+            ids: of tracks that `join` looked at: free ones, and those of objects.
+
+        Returns:
+            As `TrackWindow.misfit`.
+        """
         found, squares, dof = self._found[item.number]
         rows = np.isin(found, ids, assume_unique=True)
         return found[rows], squares[rows], dof[rows]

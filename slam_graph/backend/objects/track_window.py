@@ -108,27 +108,10 @@ class TrackWindow:
             Ids (J,) of those that were seen often enough, their squared errors (J,) over σ², and
             degrees of freedom (J,).
         """
-        obs, found = self._triangulated(ids, poses, least)
-        return obs.ids, squared_errors(obs, found, sigma_px), 2 * obs.counts - 3
-
-    def points(
-        self, ids: IntArray, poses: dict[int, gtsam.Pose3], least: int = 3
-    ) -> tuple[IntArray, FloatArray]:
-        """Where features are if they are static in that world; arguments as for `misfit`.
-
-        Returns:
-            Ids (J,) of those that were seen often enough, and positions (J, 3).
-        """
-        obs, found = self._triangulated(ids, poses, least)
-        finite = np.isfinite(found.points).all(axis=1)
-        return obs.ids[finite], found.points[finite]
-
-    def _triangulated(
-        self, ids: IntArray, poses: dict[int, gtsam.Pose3], least: int
-    ) -> tuple[Observations, Triangulation]:
         stamps = [stamp for stamp in self.stamps_ns if stamp in poses]
         obs = self.observations(ids, least, stamps)
-        return obs, self.triangulated(obs, [poses[stamp] for stamp in stamps])
+        found = self.triangulated(obs, [poses[stamp] for stamp in stamps])
+        return obs.ids, squared_errors(obs, found, sigma_px), 2 * obs.counts - 3
 
     def triangulated(self, obs: Observations, poses: Sequence[gtsam.Pose3]) -> Triangulation:
         """Some of the observations as static points of a world.

@@ -12,7 +12,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from slam_graph.arrays import IntArray
-from slam_graph.backend.aiding.fix_factors import Fix, PositionFix, fixes_of, on_the_clock, pose_key
+from slam_graph.backend.aiding.fix_factors import Fix, PositionFix, fixes_of, pose_key
 from slam_graph.backend.aiding.odometry_factors import odometry_factor
 from slam_graph.backend.aiding.world_alignment import enough_fixes
 from slam_graph.backend.backend_config import BackendConfig
@@ -64,7 +64,7 @@ def aiding_of_keyframes(
         moved = data.odometry_between(*ends) if config.odometry.enabled else None
         if moved is not None:
             odometry.append(odometry_factor((k, k + 1), moved, config.odometry))
-    near = on_the_clock(data, config).within(int(stamps_ns[0]), int(stamps_ns[-1]))
+    near = config.on_the_clock(data).within(int(stamps_ns[0]), int(stamps_ns[-1]))
     measured = fixes_of(near, config)
     fixes_ns = np.array([fix.stamp_ns for fix in measured], dtype=np.int64)
     middles = stamps_ns[:-1] + np.diff(stamps_ns) // 2

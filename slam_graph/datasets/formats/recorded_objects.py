@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam_graph.arrays import IntArray
+from slam_graph.datasets.formats.recorded_files import AGAIN, check_length, packed
 from slam_graph.datasets.streams.mask_images import LARGEST_LABEL
 from slam_graph.errors import DataError
 from slam_graph.sensors import FeatureFrame, FeatureObservations
@@ -28,7 +29,6 @@ MOVING_RECORD = np.dtype(
 )
 _NO_MASK = -1
 """Label of the features of a frame without a mask."""
-_AGAIN = "record it again"
 
 
 class ObjectColumns:
@@ -92,16 +92,16 @@ class RecordedObjects:
         self._first = np.concatenate([[0], np.cumsum(counts[:, 0])]).tolist()
         self._has_labels, self._has_moving = labels, moving > 0
         if labels:
-            self._check_size(LABELS, self._first[-1] * LABEL_RECORD.itemsize)
+            check_length(folder / LABELS, self._first[-1] * LABEL_RECORD.itemsize)
         if moving:
-            self._check_size(MOVING, moving * MOVING_RECORD.itemsize)
-            self._check_size(MOVING_FRAMES, counts.size * COUNT_RECORD.itemsize)
+            check_length(folder / MOVING, moving * MOVING_RECORD.itemsize)
+            check_length(folder / MOVING_FRAMES, counts.size * COUNT_RECORD.itemsize)
             found = np.fromfile(folder / MOVING_FRAMES, COUNT_RECORD)
             # each is checked before the sum, which cannot overflow then
             if np.any((found < 0) | (found > moving)) or int(found.sum()) != moving:
                 raise DataError(
                     f"{folder / MOVING_FRAMES}: the numbers of features do not add up to the "
-                    f"{moving} of meta.yaml; {_AGAIN}"
+                    f"{moving} of meta.yaml; {AGAIN}"
                 )
             ends = np.concatenate([[0], np.cumsum(found)])
             self._starts = ends[:-1].reshape(counts.shape)
@@ -143,8 +143,8 @@ class RecordedObjects:
         """Labels of one frame; None if it has no mask."""
         if len(labels) and np.all(labels == _NO_MASK):
             return None
-        if np.any((labels < 0) | (labels > LARGEST_LABEL)):
-            raise DataError(f"{self._folder / name}: a label is not 0 to {LARGEST_LABEL}; {_AGAIN}")
+        if unknown_labels(labels).size:
+            raise DataError(f"{self._folder / name}: a label is not 0 to {LARGEST_LABEL}; {AGAIN}")
         return labels
 
     def _rows(self, name: str, record: np.dtype[Any], first: int, end: int) -> NDArray[Any]:
@@ -152,12 +152,12 @@ class RecordedObjects:
         offset = first * record.itemsize
         return np.fromfile(self._folder / name, record, end - first, offset=offset)
 
-    def _check_size(self, name: str, expected: int) -> None:
-        file = self._folder / name
-        size = file.stat().st_size if file.is_file() else -1
-        if size != expected:
-            found = "missing" if size < 0 else f"{size} bytes long"
-            raise DataError(f"{file}: {found}, it should have {expected} bytes; {_AGAIN}")
+
+def unknown_labels(labels: IntArray | None) -> IntArray:
+    """Those of the labels (N,) of a frame that no mask can have; none if it has no mask."""
+    if labels is None:
+        return np.zeros(0, np.int64)
+    return np.asarray(labels[(labels < 0) | (labels > LARGEST_LABEL)])
 
 
 def _labels(labels: IntArray | None, count: int) -> NDArray[np.int32]:
@@ -166,7 +166,6 @@ def _labels(labels: IntArray | None, count: int) -> NDArray[np.int32]:
 
 
 def _pack(seen: FeatureObservations) -> NDArray[np.void]:
-    rows = np.empty(len(seen), MOVING_RECORD)
-    rows["id"], rows["pixel"], rows["normalized"] = seen.ids, seen.pixels, seen.normalized
+    rows = packed(seen, MOVING_RECORD)
     rows["label"] = _labels(seen.labels, len(seen))
     return rows

@@ -14,6 +14,7 @@ import numpy as np
 
 from slam_graph.arrays import FloatArray
 from slam_graph.datasets.calibration.calibration_yaml import pose_from_matrix
+from slam_graph.datasets.formats.recorded_files import AGAIN
 from slam_graph.errors import DataError
 from slam_graph.geometry import NavState, Trajectory
 
@@ -32,7 +33,6 @@ _STATE_SHAPES: dict[str, _Shape] = {
 }
 _UNIT_TOLERANCE = 1e-3
 """Largest error of the length of a quaternion: those of ground truth are rounded."""
-_AGAIN = "record it again"
 
 
 def save_trajectory(path: Path, trajectory: Trajectory) -> None:
@@ -46,7 +46,7 @@ def load_trajectory(path: Path) -> Trajectory:
     stamps, lengths = arrays["stamps_ns"], np.linalg.norm(arrays["quaternions"], axis=1)
     if np.any(stamps[1:] <= stamps[:-1]) or np.any(np.abs(lengths - 1.0) > _UNIT_TOLERANCE):
         raise DataError(
-            f"{path}: the times do not increase, or a quaternion is not of unit length; {_AGAIN}"
+            f"{path}: the times do not increase, or a quaternion is not of unit length; {AGAIN}"
         )
     return Trajectory(
         stamps_ns=arrays["stamps_ns"],
@@ -71,7 +71,7 @@ def load_state(path: Path) -> NavState:
     pose_from_matrix(arrays["world_T_body"], f"{path}: world_T_body")
     covariance = arrays.get("covariance")
     if covariance is not None and not _is_covariance(covariance):
-        raise DataError(f"{path}: 'covariance' is not a covariance; {_AGAIN}")
+        raise DataError(f"{path}: 'covariance' is not a covariance; {AGAIN}")
     return NavState(
         stamp_ns=int(arrays["stamp_ns"]),
         world_T_body=gtsam.Pose3(arrays["world_T_body"]),  # as it was, to the last bit
@@ -99,17 +99,17 @@ def _load(path: Path, required: tuple[str, ...], shapes: dict[str, _Shape]) -> d
         with ZipFile(path) as archive:
             unpacked = sum(member.file_size for member in archive.infolist())
         if unpacked > path.stat().st_size:  # the recorder does not compress
-            raise DataError(f"{path}: its arrays are larger than the file; {_AGAIN}")
+            raise DataError(f"{path}: its arrays are larger than the file; {AGAIN}")
         with path.open("rb") as data, np.load(data, allow_pickle=False) as file:
             arrays = {name: file[name] for name in file.files if name in shapes}
     except DataError:
         raise
     except Exception as error:  # a damaged zip fails in many ways
         what = " ".join(str(error).split())[:150] or type(error).__name__
-        raise DataError(f"{path}: cannot be read ({what}); {_AGAIN}") from None
+        raise DataError(f"{path}: cannot be read ({what}); {AGAIN}") from None
     missing = [name for name in required if name not in arrays]
     if missing:
-        raise DataError(f"{path}: no array '{missing[0]}' in this file; {_AGAIN}")
+        raise DataError(f"{path}: no array '{missing[0]}' in this file; {AGAIN}")
     count = arrays["stamps_ns"].size if "stamps_ns" in arrays else 0
     for name, array in arrays.items():
         dtype = np.dtype("i8" if name.startswith("stamp") else "f8")
@@ -117,10 +117,10 @@ def _load(path: Path, required: tuple[str, ...], shapes: dict[str, _Shape]) -> d
         if array.shape != shape or array.dtype != dtype:
             raise DataError(
                 f"{path}: '{name}' has shape {array.shape} and type {array.dtype}, expected "
-                f"{shape} and {dtype}; {_AGAIN}"
+                f"{shape} and {dtype}; {AGAIN}"
             )
         if not np.isfinite(array).all():
-            raise DataError(f"{path}: '{name}' is not finite; {_AGAIN}")
+            raise DataError(f"{path}: '{name}' is not finite; {AGAIN}")
     return arrays
 
 

@@ -17,9 +17,11 @@ from numpy.typing import NDArray
 
 from slam_graph.datasets.calibration.kalibr_calibration import write_kalibr
 from slam_graph.datasets.formats import track_recording as layout
-from slam_graph.datasets.formats.recorded_objects import ObjectColumns
+from slam_graph.datasets.formats.recorded_files import packed
+from slam_graph.datasets.formats.recorded_objects import ObjectColumns, unknown_labels
 from slam_graph.datasets.formats.recorded_states import save_state, save_trajectory
 from slam_graph.datasets.streams.aiding_files import aiding_texts
+from slam_graph.datasets.streams.mask_images import LARGEST_LABEL
 from slam_graph.errors import DataError
 from slam_graph.files import Files
 from slam_graph.geometry import NavState, Trajectory
@@ -93,8 +95,10 @@ class TrackRecorder:
     ) -> None:
         try:
             with Files.writing(self.path):  # what is buffered is written when a file is closed
-                of_objects = self._objects.finish() if kind is None else {}
-                self._files.close()
+                try:
+                    of_objects = self._objects.finish() if kind is None else {}
+                finally:
+                    self._files.close()
                 if kind is None:
                     self._finish(of_objects)
         except DataError:
@@ -113,23 +117,39 @@ class TrackRecorder:
             aiding: fixes and odometry since the packet before.
 
         Raises:
-            DataError: if the frame is not later, has another number of cameras than the rig, or
-                cannot be written.
+            DataError: if the frame is not later, has another number of cameras than the rig, has a
+                label that is not 0 to 65535, or cannot be written.
         """
+        self._check(frame)
+        if aiding is not None:
+            self._aiding.append(aiding)
+        with Files.writing(self.path):
+            self._append(imu, frame)
+
+    def _check(self, frame: FeatureFrame) -> None:
+        """Refuse a frame that could not be read again."""
         if len(frame.cameras) != len(self.rig.cameras):
             raise DataError(
                 f"{self.path}: a frame with {len(frame.cameras)} cameras cannot be recorded for a "
                 f"rig with {len(self.rig.cameras)}"
+            )
+        if len(frame.moving) not in (0, len(self.rig.cameras)):
+            raise DataError(
+                f"{self.path}: a frame with features that move in {len(frame.moving)} cameras "
+                f"cannot be recorded for a rig with {len(self.rig.cameras)}"
             )
         if self._latest_ns is not None and frame.stamp_ns <= self._latest_ns:
             raise DataError(
                 f"{self.path}: a frame at {frame.stamp_ns} cannot be recorded after one at "
                 f"{self._latest_ns}"
             )
-        if aiding is not None:
-            self._aiding.append(aiding)
-        with Files.writing(self.path):
-            self._append(imu, frame)
+        for seen in (frame.cameras[0], *frame.moving):
+            wrong = unknown_labels(seen.labels)
+            if wrong.size:
+                raise DataError(
+                    f"{self.path}: a feature with the label {wrong[0]} cannot be recorded, labels "
+                    f"are 0 to {LARGEST_LABEL}"
+                )
 
     def _append(self, imu: ImuData, frame: FeatureFrame) -> None:
         self._write_descriptors(frame.cameras[0])
@@ -141,7 +161,7 @@ class TrackRecorder:
         row["stamp"], row["counts"] = frame.stamp_ns, [len(seen) for seen in frame.cameras]
         self._frames.write(row.tobytes())
         for seen in frame.cameras:
-            self._features.write(_pack(seen).tobytes())
+            self._features.write(packed(seen, layout.FEATURE_RECORD).tobytes())
         if self._depth_camera is not None:
             self._depths.write(_pack_depth(frame.cameras[self._depth_camera]).tobytes())
         self._objects.write(frame)
@@ -198,12 +218,6 @@ class TrackRecorder:
             (self._folder / name).write_text(text, encoding="utf-8")
         self._folder.chmod(0o755)
         self._folder.rename(self.path)
-
-
-def _pack(seen: FeatureObservations) -> NDArray[np.void]:
-    rows = np.empty(len(seen), layout.FEATURE_RECORD)
-    rows["id"], rows["pixel"], rows["normalized"] = seen.ids, seen.pixels, seen.normalized
-    return rows
 
 
 def _pack_depth(seen: FeatureObservations) -> NDArray[np.void]:

@@ -43,6 +43,7 @@ from numpy.typing import NDArray
 
 from slam_graph.datasets.calibration.calibration_yaml import YamlValue, read_yaml
 from slam_graph.datasets.calibration.kalibr_calibration import read_kalibr
+from slam_graph.datasets.formats.recorded_files import AGAIN, check_length
 from slam_graph.datasets.formats.recorded_objects import MOVING, RecordedObjects
 from slam_graph.datasets.formats.recorded_states import load_state, load_trajectory
 from slam_graph.datasets.sequence import (
@@ -72,7 +73,6 @@ DEPTH_RECORD = np.dtype([("depth", "<f8"), ("sigma", "<f8")])
 
 
 _MAX_CAMERAS = 64
-_AGAIN = "record it again"
 
 
 def frame_record(cameras: int) -> np.dtype[np.void]:
@@ -125,7 +125,7 @@ class TrackRecordingSequence(RecordedSequence):
         if version.text() != str(FORMAT_VERSION):
             raise DataError(
                 f"{version.where}: recording of version {version.text()[:20]}, this program reads "
-                f"version {FORMAT_VERSION}; record it again"
+                f"version {FORMAT_VERSION}; {AGAIN}"
             )
         recorded = read_kalibr(path / CALIBRATION)
         chain = options.calibration
@@ -154,7 +154,7 @@ class TrackRecordingSequence(RecordedSequence):
         self._check_descriptors()
         if self._depth_camera is not None:
             features = int(self._index["counts"][:, self._depth_camera].sum())
-            self._check_size(DEPTHS, features * DEPTH_RECORD.itemsize)
+            check_length(self.path / DEPTHS, features * DEPTH_RECORD.itemsize)
         labels, moving = meta.get("labels"), meta.get("moving_features")
         self._has_labels = labels is not None and _whole(labels, 0, 1) > 0
         moves = 0 if moving is None else _whole(moving)
@@ -244,7 +244,7 @@ class TrackRecordingSequence(RecordedSequence):
         else:
             normalized = np.ascontiguousarray(rows["normalized"])
         if not (np.isfinite(pixels).all() and np.isfinite(normalized).all()):
-            raise DataError(f"{self.path / name}: a feature is not finite; {_AGAIN}")
+            raise DataError(f"{self.path / name}: a feature is not finite; {AGAIN}")
         return FeatureObservations(ids, pixels, normalized)
 
     def _with_depth(self, seen: FeatureObservations, data: bytes) -> FeatureObservations:
@@ -253,7 +253,7 @@ class TrackRecordingSequence(RecordedSequence):
         known = ~np.isnan(depth)
         usable = (depth[known] > 0.0) & np.isfinite(depth[known]) & (sigma[known] > 0.0)
         if not (usable.all() and np.isfinite(sigma[known]).all()):
-            raise DataError(f"{self.path / DEPTHS}: a depth or its sigma is not positive; {_AGAIN}")
+            raise DataError(f"{self.path / DEPTHS}: a depth or its sigma is not positive; {AGAIN}")
         return replace(seen, depth_m=depth, depth_sigma_m=sigma)
 
     def _open_depths(self, files: ExitStack, before: NDArray[np.int64]) -> BinaryIO | None:
@@ -279,15 +279,15 @@ class TrackRecordingSequence(RecordedSequence):
         if np.any((counts < 0) | (counts > features)) or int(counts.sum()) != features:
             raise DataError(
                 f"{self.path / FRAMES}: the numbers of features do not add up to the {features} of "
-                f"{META}; {_AGAIN}"
+                f"{META}; {AGAIN}"
             )
         if np.any(stamps[1:] <= stamps[:-1]) or np.any(np.abs(stamps) >= LARGEST_STAMP_NS):
-            raise DataError(f"{self.path / FRAMES}: the times do not increase; {_AGAIN}")
+            raise DataError(f"{self.path / FRAMES}: the times do not increase; {AGAIN}")
 
     def _check_descriptors(self) -> None:
         if self._descriptor_bytes:
             features = int(self._index["counts"][:, 0].sum())
-            self._check_size(DESCRIPTORS, features * self._descriptor_bytes)
+            check_length(self.path / DESCRIPTORS, features * self._descriptor_bytes)
 
     def _check_sizes(self, counts: dict[str, int]) -> None:
         """Refuse files that are not as long as the recorder left them."""
@@ -297,11 +297,4 @@ class TrackRecordingSequence(RecordedSequence):
             FEATURES: counts["features"] * FEATURE_RECORD.itemsize,
         }
         for name, expected in sizes.items():
-            self._check_size(name, expected)
-
-    def _check_size(self, name: str, expected: int) -> None:
-        file = self.path / name
-        size = file.stat().st_size if file.is_file() else -1
-        if size != expected:
-            found = "missing" if size < 0 else f"{size} bytes long"
-            raise DataError(f"{file}: {found}, {META} says {expected} bytes; record it again")
+            check_length(self.path / name, expected)
