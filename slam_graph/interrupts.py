@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
 
-__all__ = ["Deferred", "Interrupts"]
+__all__ = ["Interrupts"]
 
 _GRACE_S = 10.0
 """Time for a process to end after Ctrl-C before it is killed."""
@@ -171,8 +171,13 @@ def leave_to_parent() -> None:
 
 
 class Interrupts:
-    """What is done about signals."""
+    """What is done about signals.
 
+    Attributes:
+        Deferral: what `deferred` yields.
+    """
+
+    Deferral = Deferred
     completed = staticmethod(completed)
     deferred = staticmethod(deferred)
     end_with = staticmethod(end_with)

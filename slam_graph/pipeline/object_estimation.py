@@ -13,7 +13,6 @@ import numpy as np
 
 from slam_graph.backend import Estimator, MovingObjects, ObjectFrame, ObjectSmoother
 from slam_graph.datasets import RecordedSequence
-from slam_graph.datasets.object_sources import LabelsOverTime
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.frontend import Feedback
 from slam_graph.pipeline.stage import EstimatedFrame, NoObjects, warn_on_failure
@@ -45,8 +44,7 @@ class Objects(NoObjects):
         super().__init__()
         config = result.config
         self._result, self._estimator, self._diagnostics = result, estimator, diagnostics
-        has_masks = recording is not None and recording.masks > 0
-        self._labels = LabelsOverTime(recording) if recording and has_masks else None
+        self._labels = recording.labels_over_time() if recording is not None else None
         self._wanted = config.objects.features
         self._objects = result.objects = MovingObjects(
             result.causal_rig,

@@ -12,7 +12,7 @@ from typing import Literal
 
 from slam_graph.backend import Estimator
 from slam_graph.errors import SlamGraphError
-from slam_graph.interrupts import Deferred
+from slam_graph.interrupts import Interrupts
 from slam_graph.pipeline.agreement import DivergenceError
 from slam_graph.pipeline.stage import COMPLETED, Stage
 from slam_graph.results import RunResult
@@ -41,7 +41,7 @@ def outcome(result: RunResult, estimator: Estimator) -> Iterator[None]:
     logger.log(level, "%s", ending.message or done)
 
 
-def finish(stages: Iterable[Stage], result: RunResult, interrupts: Deferred) -> None:
+def finish(stages: Iterable[Stage], result: RunResult, interrupts: Interrupts.Deferral) -> None:
     """Finish all stages; Ctrl-C ends the one at work, and those that come after are short then.
 
     A stage that fails does not keep the others from finishing.
