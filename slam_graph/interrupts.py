@@ -11,6 +11,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
+from typing import TypeAlias
 
 __all__ = ["Interrupts"]
 
@@ -177,7 +178,7 @@ class Interrupts:
         Deferral: what `deferred` yields.
     """
 
-    Deferral = Deferred
+    Deferral: TypeAlias = Deferred
     completed = staticmethod(completed)
     deferred = staticmethod(deferred)
     end_with = staticmethod(end_with)
