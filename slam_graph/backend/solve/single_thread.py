@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 from contextlib import AbstractContextManager, nullcontext
-from functools import cache
 
 from threadpoolctl import ThreadpoolController
 
@@ -14,7 +13,7 @@ class SingleThread:
     """Holds the BLAS libraries that are loaded to one thread, for a while."""
 
     def __init__(self) -> None:
-        self._blas = _blas()
+        self._blas = ThreadpoolController().select(user_api="blas")
 
     def held(self) -> AbstractContextManager[object]:
         """For the time of a block; it is quick where there is but one thread anyway."""
@@ -22,9 +21,3 @@ class SingleThread:
             return nullcontext()
         limited: AbstractContextManager[object] = self._blas.limit(limits=1)
         return limited
-
-
-@cache
-def _blas() -> ThreadpoolController:
-    """The libraries, looked for once: that takes milliseconds, and objects come and go."""
-    return ThreadpoolController().select(user_api="blas")
