@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -15,25 +15,21 @@ from gtsam.symbol_shorthand import B, L, V, X
 
 from slam_graph import run
 from slam_graph.arrays import FloatArray
-from slam_graph.backend.backend_config import BackendConfig, DynamicsConfig
-from slam_graph.backend.cost.imu_factor import imu_factor
-from slam_graph.backend.dynamics import model_rig
+from slam_graph.backend.backend_config import BackendConfig
 from slam_graph.backend.estimator import Estimator
 from slam_graph.backend.initialization.monocular_start import scale_direction
 from slam_graph.backend.initialization.start_diagnosis import Refusal
 from slam_graph.backend.initialization.two_views import TwoViews, two_view_motion
 from slam_graph.backend.policies import AlgorithmConfig
 from slam_graph.backend.solve.square_root import Layout
-from slam_graph.backend.solve.state import State, dims_of
-from slam_graph.backend.visual_motion import VisualMotion
+from slam_graph.backend.solve.state import dims_of
 from slam_graph.errors import DataError
 from slam_graph.evaluation import ape
-from slam_graph.geometry import NavState, Similarity, Trajectory
+from slam_graph.geometry import Similarity, Trajectory
 from slam_graph.sensors import (
     Camera,
     FeatureFrame,
     FeatureObservations,
-    ImuData,
     Rig,
     RigCamera,
 )
@@ -225,44 +221,6 @@ def test_images_do_not_change_when_the_world_is_scaled_about_the_path_of_the_cam
     np.testing.assert_allclose(
         moved.rotation().unrotate(velocity) + turning, (1.0 + step) * of_camera
     )
-
-
-def test_the_dynamics_do_not_measure_the_scale_where_a_frame_is_linearised() -> None:
-    """A body that speeds up and turns: rotation and rate of the images, and no pull on the scale.
-
-    Along the scaling of the world rows of the dynamics vanish, and at the true pose they do not.
-    """
-    rig = Rig((RigCamera(CAMERA, gtsam.Pose3()),), has_imu=False)
-    before = NavState(
-        0, SECOND, np.array([0.5, -0.3, 0.8]), accel_bias=np.zeros(3), gyro_bias=-np.ones(3) * 0.4
-    )
-    bias = gtsam.imuBias.ConstantBias(before.accel_bias, before.gyro_bias)
-    samples = ImuData(50_000_000 * np.arange(2), np.zeros((2, 3)), np.zeros((2, 3)))
-    params = model_rig(rig, DynamicsConfig()).imu.preintegration_params(0.0)
-    pim = samples.preintegrated(bias, params)
-    predicted = before.predicted(pim, 50_000_000)
-    change = gtsam.Pose3(gtsam.Rot3.Expmap([0.02, 0.05, -0.03]), np.array([0.03, 0.02, -0.01]))
-    true = predicted.world_T_body.compose(change)
-    points = np.asarray(SECOND.transformFrom(room(np.random.default_rng(5)).T)).T
-    local, ids = np.asarray(true.transformTo(points.T)).T, np.arange(len(points))
-    m = local[:, :2] / local[:, 2:]
-    frame = FeatureFrame(50_000_000, (FeatureObservations(ids, CAMERA.project(local), m),))
-    found = VisualMotion(rig, 10).corrected(before, predicted, (None, frame), (ids, points))
-    assert found.world_T_body.rotation().equals(true.rotation(), 1e-4)
-
-    def pull(later: NavState) -> float:
-        """How much the whitened rows of the dynamics change with the scale."""
-        states = State()
-        states.insert_imu_state(0, before)
-        states.insert_imu_state(1, later)
-        linear = imu_factor(0, 1, pim).linearize(states.frames)
-        jacobian = gtsam.JacobianFactor(linear)
-        layout = Layout(dims_of(jacobian.keys()))
-        direction = scale_direction(states.frames, layout, true.translation(), np.zeros(3))
-        return float(np.linalg.norm(jacobian.jacobian()[0] @ direction))
-
-    assert pull(found) < 1e-6
-    assert pull(replace(found, world_T_body=true)) > 0.1
 
 
 def test_a_camera_that_only_turns_waits_and_starts_when_it_moves() -> None:

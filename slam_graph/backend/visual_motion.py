@@ -9,12 +9,6 @@ it, and one Gauss-Newton step from there ends beside the minimum. So the new pos
 PnP from points that are known already: features of the estimator, and those whose depth the last
 frame has by a second camera or a depth sensor. It is the point at which the new state is
 linearised, not a measurement: its images still come, and count once.
-
-Where nothing measures lengths, only the rotation is taken from there. The residual of the dynamics
-is a length, so if it is not zero at the point of linearisation, it changes with the scale: the
-dynamics then measure the scale, and pull it towards zero. At a position where constant velocity
-leads it is zero, and images are nearly linear from there on, as a frame later a body is off by
-millimetres.
 """
 
 from __future__ import annotations
@@ -68,8 +62,6 @@ class VisualMotion:
     ) -> NavState:
         """The predicted state with the pose, velocity and rate that the images show.
 
-        With one camera alone, only rotation and rate are theirs.
-
         Args:
             before: state at the last frame.
             predicted: state at the new one, by constant velocity, or by an IMU of which samples are
@@ -87,8 +79,6 @@ class VisualMotion:
             pose = self._pose(frame, ids, points, self._rate(found, before))
             if pose is None:
                 return predicted
-            if not self._rig.has_scale:
-                pose = gtsam.Pose3(pose.rotation(), predicted.world_T_body.translation())
             found = moved_to(before, predicted, pose, self._rig.has_imu)
         return found
 
