@@ -151,6 +151,12 @@ class RunConfig(Settings):
         """
         return load_config(self.objects.algorithm or config_folder() / "objects.yaml").algorithm
 
+    @property
+    def used_frontend(self) -> FrontendConfig:
+        """Settings of the front end; what moves is kept where objects are estimated."""
+        moving = self.frontend.keep_moving or self.objects.enabled
+        return self.frontend.model_copy(update={"keep_moving": moving})
+
     def _facts(self) -> dict[str, object]:
         """The policies of the algorithm, and what differs from the defaults."""
         table = self.algorithm.model_dump(mode="json")

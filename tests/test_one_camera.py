@@ -26,13 +26,7 @@ from slam_graph.backend.solve.state import dims_of
 from slam_graph.errors import DataError
 from slam_graph.evaluation import ape
 from slam_graph.geometry import Similarity, Trajectory
-from slam_graph.sensors import (
-    Camera,
-    FeatureFrame,
-    FeatureObservations,
-    Rig,
-    RigCamera,
-)
+from slam_graph.sensors import Camera, FeatureFrame, FeatureObservations, Rig, RigCamera
 from slam_graph.simulation import simulate
 from slam_graph.simulation.simulated_sequence import SimulatedSequence
 

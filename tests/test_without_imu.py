@@ -19,7 +19,7 @@ from slam_graph.backend.backend_config import BackendConfig, CalibrationConfig, 
 from slam_graph.backend.depth_camera import with_depth_camera, with_depth_observed
 from slam_graph.backend.dynamics import Dynamics, model_rig, motionless_samples
 from slam_graph.backend.policies import AlgorithmConfig
-from slam_graph.backend.visual_motion import depths_within
+from slam_graph.backend.visual_motion import VisualMotion, depths_within
 from slam_graph.backend.world_gauge import gauge_motion, with_unknown_gauge, world_motion
 from slam_graph.datasets import open_dataset
 from slam_graph.errors import ConfigError, DataError
@@ -231,6 +231,41 @@ def test_the_rotation_between_two_images_is_found(degrees: tuple[float, ...]) ->
     found = Rotation.from_matrix(ImageRotation(CAMERA).between(before, after))
     difference = found * Rotation.from_matrix(after_R_before).inv()
     assert np.degrees(difference.magnitude()) < 0.25
+
+
+@pytest.mark.parametrize("with_imu", [False, True])
+def test_rows_of_a_rolling_shutter_are_undone_where_images_show_the_motion(with_imu: bool) -> None:
+    """A body that turns; the prediction says that it does not, as where samples are missing."""
+    rig = simulate(cameras=1, duration_s=1.0).rig
+    mounted = replace(rig.cameras[0], readout_s=0.02, rolling_shutter=True)
+    rig = replace(rig, cameras=(mounted,), has_imu=with_imu)
+    rate, step_ns = np.array([0.3, -0.8, 0.5]), 50_000_000
+    pose = gtsam.Pose3(gtsam.Rot3.Expmap(rate * step_ns * 1e-9), np.zeros(3))
+    rng = np.random.default_rng(4)
+    camera = mounted.camera
+    z = rng.uniform(2.0, 6.0, 80)
+    m = rng.uniform(-0.35, 0.35, (80, 2))
+    local = np.asarray(mounted.body_T_camera.transformFrom(np.column_stack([m, 0 * z + 1]).T * z))
+    points = np.asarray(pose.transformFrom(local)).T
+    pixels = camera.project(np.column_stack([m, np.ones(80)]))
+    for _ in range(8):  # the row tells the time, and the pose at this time the row
+        late = mounted.row_times_s(pixels[:, 1]) - mounted.middle_s
+        turned = [
+            pose.compose(gtsam.Pose3(gtsam.Rot3.Expmap(rate * s), np.zeros(3)))
+            .compose(mounted.body_T_camera)
+            .transformTo(point)
+            for s, point in zip(late, points, strict=True)
+        ]
+        pixels = camera.project(np.array(turned))
+    ids = np.arange(80)
+    frame = FeatureFrame(step_ns, (FeatureObservations(ids, pixels, camera.undistort(pixels)),))
+    none = np.zeros(3)
+    before = NavState(0, gtsam.Pose3(), none, accel_bias=none, gyro_bias=none)
+    predicted = replace(before, stamp_ns=step_ns)
+    found = VisualMotion(rig, 10).corrected(before, predicted, (None, frame), (ids, points))
+    turn = gtsam.Rot3.Logmap(found.world_T_body.rotation().between(pose.rotation()))
+    assert np.linalg.norm(turn) < 2e-4
+    assert np.linalg.norm(found.world_T_body.translation()) < 1e-3
 
 
 def test_a_camera_is_found_by_points_that_it_sees_and_outliers_are_named() -> None:

@@ -216,11 +216,9 @@ class RecordTask(Settings):
         start_ns = info.start_ns + round(config.start_s * 1e9)
         length_s = config.duration_s
         end_ns = None if length_s is None else start_ns + round(length_s * 1e9)
-        objects = config.objects.enabled
-        moving = config.frontend.keep_moving or objects
         frontend = build_frontend(
             sequence.rig,
-            config.frontend.model_copy(update={"keep_moving": moving}),
+            config.used_frontend,
             self.seed,
             sequence.diagnostics,
             info.content,
@@ -228,7 +226,7 @@ class RecordTask(Settings):
         )
         truth, start = sequence.groundtruth(), sequence.initial_state()
         labels, notes = None, {}
-        if objects and isinstance(sequence, RecordedSequence):
+        if config.objects.enabled and isinstance(sequence, RecordedSequence):
             labels, notes = sequence.labels_over_time(), sequence.classes_file()
         with TrackRecorder(
             self.folder, sequence.rig, self.source.name, truth, start, notes

@@ -213,10 +213,9 @@ def _part_of(sequence: Sequence, config: RunConfig) -> RunInput:
 def _tracking(sequence: Sequence, asked: RunInput) -> Tracking:
     """Front end and reader of the recording."""
     config = asked.config
-    moving = config.frontend.keep_moving or config.objects.enabled
     frontend = build_frontend(
         asked.rig,
-        config.frontend.model_copy(update={"keep_moving": moving}),
+        config.used_frontend,
         config.seed,
         sequence.diagnostics,
         asked.info.content,

@@ -278,5 +278,5 @@ class Verdict(Stage):
         kept = self._kept
         if kept.pairs and kept.shared < _FEWEST_SHARED:
             return True
-        of = self._final_rig(), kept.frames, kept.imu, self._lost
-        return bool(Diagnosis.nearby(*of).setup_faults)
+        looked = Diagnosis.nearby(self._final_rig(), kept.frames, kept.imu, self._lost)
+        return bool(looked.setup_faults)

@@ -35,6 +35,7 @@ from slam_graph.backend.smoothing.recording_problem import (
 from slam_graph.backend.smoothing.recording_segment import RecordingSegment, read_segment
 from slam_graph.backend.smoothing.smoothing_config import FinalBaConfig
 from slam_graph.backend.smoothing.track_fusion import with_fused_features
+from slam_graph.backend.solve.single_thread import on_one_thread
 from slam_graph.backend.world_gauge import in_gauge_of, in_moved_world, world_motion
 from slam_graph.errors import EstimationError
 from slam_graph.geometry import NavState, StateHistory, Trajectory
@@ -86,6 +87,7 @@ class FinalBa:
         return self.history.trajectory()
 
     @staticmethod
+    @on_one_thread
     def of_worlds(
         log: FrameLog,
         causal: Trajectory,

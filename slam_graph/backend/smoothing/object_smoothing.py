@@ -33,6 +33,7 @@ from slam_graph.backend.smoothing.joint_objects import joined
 from slam_graph.backend.smoothing.object_log import ObjectLog
 from slam_graph.backend.smoothing.smoothed_objects import smoothed_states
 from slam_graph.backend.smoothing.smoothing_config import FinalBaConfig
+from slam_graph.backend.solve.single_thread import on_one_thread
 from slam_graph.errors import EstimationError
 from slam_graph.geometry import NavState, StateHistory, Trajectory, interpolate
 from slam_graph.sensors import FeatureFrame, ImuData, Rig
@@ -77,6 +78,7 @@ class ObjectSmoother:
         if self._log is not None:
             self._log.add(frame, members)
 
+    @on_one_thread
     def smooth(
         self, objects: MovingObjects, rig: Rig, platform: FinalBa, config: FinalBaConfig
     ) -> tuple[FinalBa, list[str]]:

@@ -1,12 +1,21 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""BLAS on one thread: to wake others for small matrices costs many times what they save."""
+"""BLAS on one thread: to wake others for small matrices costs many times what they save.
+
+With several threads the order of sums, and so the last digit, depends on their number.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
+from functools import wraps
+from typing import ParamSpec, TypeVar
 
 from threadpoolctl import ThreadpoolController
+
+_Arguments = ParamSpec("_Arguments")
+_Result = TypeVar("_Result")
 
 
 class SingleThread:
@@ -21,3 +30,14 @@ class SingleThread:
             return nullcontext()
         limited: AbstractContextManager[object] = self._blas.limit(limits=1)
         return limited
+
+
+def on_one_thread(function: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result]:
+    """The function with the BLAS libraries held to one thread while it runs."""
+
+    @wraps(function)
+    def held(*args: _Arguments.args, **kwargs: _Arguments.kwargs) -> _Result:
+        with SingleThread().held():
+            return function(*args, **kwargs)
+
+    return held
