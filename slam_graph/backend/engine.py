@@ -59,7 +59,7 @@ class SquareRootEngine:
             marginalize_step(window, constructed, minimum, self._policies)
         self._posterior, self._cost = minimum.posterior, constructed.cost
         state = window.current(minimum.posterior)
-        report.correction = context.propagation.learn(state)
+        report.correction = context.propagation.learn(state, frame.features)
         context.pixels.learn(constructed.cost, constructed.offered, stamp_ns)
         return context.propagation.reported(state)
 

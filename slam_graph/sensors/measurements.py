@@ -198,6 +198,11 @@ class FeatureFrame:
     moving: tuple[FeatureObservations, ...] = ()
 
     @property
+    def features(self) -> int:
+        """The number of features in the camera that sees most of them."""
+        return max((len(camera.ids) for camera in self.cameras), default=0)
+
+    @property
     def whole(self) -> FeatureFrame:
         """The frame with the features that move by themselves among the others."""
         if not self.moving:

@@ -19,7 +19,11 @@ from gtsam.symbol_shorthand import B, V, X
 from slam_graph.arrays import FloatArray
 from slam_graph.backend.aiding.aiding_factors import Aiding
 from slam_graph.backend.backend_config import BackendConfig
-from slam_graph.backend.cost.adaptive_imu_noise import DynamicsNoise, MotionChange
+from slam_graph.backend.cost.adaptive_imu_noise import (
+    FEWEST_FEATURES,
+    DynamicsNoise,
+    MotionChange,
+)
 from slam_graph.backend.cost.vibration_covariance import VibrationCovariance
 from slam_graph.backend.cost.zero_velocity import zero_velocity_factors
 from slam_graph.backend.solve.state import State
@@ -227,10 +231,15 @@ class Propagation:
         """The state of the last frame with the covariance that vibration gives it."""
         return self._vibration.added_to(state)
 
-    def learn(self, state: NavState) -> VelocityCorrection | None:
+    def learn(self, state: NavState, features: int) -> VelocityCorrection | None:
         """Adapt the noise of the IMU to the difference of an estimate from its prediction.
 
-        Not at a standstill, whose zero velocity is no measurement of images.
+        Not at a standstill, whose zero velocity is no measurement of images, and not where an IMU
+        is corrected by a few features: one that slides along an edge has a say in all of these.
+
+        Args:
+            state: the estimate of the last frame, with its covariance.
+            features: how many the frame has.
 
         Returns:
             How the velocity was corrected; None where nothing was learned.
@@ -240,7 +249,8 @@ class Propagation:
             if not self._still:
                 dt_s = (state.stamp_ns - self._last.stamp_ns) * 1e-9
                 correction = VelocityCorrection.of(self._predicted, state)
-                self.noise.learn(self._predicted, state, dt_s)
+                if self.guesses or features >= FEWEST_FEATURES:
+                    self.noise.learn(self._predicted, state, dt_s)
             if self._counts_vibration():
                 assert self._predicted.covariance is not None
                 assert state.covariance is not None

@@ -112,7 +112,7 @@ class SmootherEngine:
             self._solve(window, ahead, new)
         with report.timed("covariance"):
             state = self._advance(window, ahead, predicted)
-        report.correction = propagation.learn(state)
+        report.correction = propagation.learn(state, frame.features)
         return propagation.reported(state)
 
     def _predicted(self, ahead: Window) -> NavState:

@@ -21,6 +21,8 @@ from slam_graph.backend.window import Window
 from slam_graph.geometry import NavState
 from slam_graph.sensors import ImuData
 
+_BLOCKS = 10
+"""Blocks into which the samples at rest are divided, for the scatter of their mean."""
 _LEAST_FORCE = 1.0
 """m/s²: a specific force at rest that is smaller is not that of gravity, and levels nothing."""
 
@@ -43,24 +45,41 @@ def state_at_rest(samples: ImuData, stamp_ns: int, prior: PriorConfig) -> NavSta
         np.zeros(3),
         accel_bias=np.zeros(3),
         gyro_bias=samples.gyro.mean(axis=0),
-        covariance=_covariance_at_rest(force, prior),
+        covariance=_covariance_at_rest(samples.accel, prior),
     )
 
 
-def _covariance_at_rest(force: FloatArray, prior: PriorConfig) -> FloatArray:
+def _covariance_at_rest(forces: FloatArray, prior: PriorConfig) -> FloatArray:
     """Covariance (15, 15) of a state whose tilt was taken from the specific force at rest.
 
-    The force is that of gravity, g u in the body frame, and the bias b. With R = R̂ exp(δ) the
-    levelled attitude R̂ u ∥ z has g u × (δ × u) = u × b, that is δ = u × b / g across u. Left out,
-    the two would be uncertain apart, and the first acceleration unknown by g times the tilt.
+    The mean force is that of gravity, g u in the body frame, the bias b, and its error n. With
+    R = R̂ exp(δ) the levelled attitude R̂ u ∥ z has g u × (δ × u) = u × (b + n), that is
+    δ = u × (b + n) / g across u. Left out, tilt and bias would be uncertain apart, and the first
+    acceleration unknown by g times the tilt.
 
     Args:
-        force: (3,) mean specific force, m/s².
-        prior: standard deviations; that of the attitude is what the bias does not explain.
+        forces: (N, 3) specific forces, m/s².
+        prior: standard deviations; that of the attitude is what neither the bias nor the scatter
+            of the forces explains.
     """
+    force = forces.mean(axis=0)
+    tilt = skew(force) / max(float(force @ force), _LEAST_FORCE**2)  # u / g
     root = np.eye(15)
-    root[:3, 9:12] = skew(force) / max(float(force @ force), _LEAST_FORCE**2)  # u / g
-    return np.asarray(root @ prior_covariance(prior) @ root.T)
+    root[:3, 9:12] = tilt
+    covariance = root @ prior_covariance(prior) @ root.T
+    covariance[:3, :3] += tilt @ _covariance_of_mean(forces) @ tilt.T
+    return np.asarray(covariance)
+
+
+def _covariance_of_mean(forces: FloatArray) -> FloatArray:
+    """Covariance (3, 3) of the mean of forces (N, 3), by the means of blocks of time.
+
+    Vibration of motors is correlated from sample to sample, and hardly from block to block.
+    """
+    if len(forces) < 2 * _BLOCKS:
+        return np.zeros((3, 3))
+    means = np.array([block.mean(axis=0) for block in np.array_split(forces, _BLOCKS)])
+    return np.asarray(np.cov(means, rowvar=False) / _BLOCKS)
 
 
 def level_rotation(specific_force: FloatArray) -> gtsam.Rot3:
