@@ -25,6 +25,7 @@ class AdjustmentFigures:
         imu_residual: root mean square of the whitened IMU residuals.
         pixel_residual: root mean square of the whitened reprojection residuals.
         pixel_sigma: assumed standard deviation of the observations at the end, pixels.
+        inefficiency: how many of them say as much as one that is independent of the others.
     """
 
     keyframes: int
@@ -36,6 +37,7 @@ class AdjustmentFigures:
     imu_residual: float
     pixel_residual: float
     pixel_sigma: float
+    inefficiency: float
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -86,6 +88,7 @@ def summary_of(
         imu_residual=rms("imu_residual", "keyframes"),
         pixel_residual=rms("pixel_residual", "observations"),
         pixel_sigma=rms("pixel_sigma", "observations"),
+        inefficiency=rms("inefficiency", "observations"),
         seconds=time.perf_counter() - began[0],
         cpu_seconds=time.process_time() - began[1],
     )

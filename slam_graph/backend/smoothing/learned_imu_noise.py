@@ -87,9 +87,9 @@ def equations_at_minimum(
 ) -> EliminatedMinimum:
     """The normal equations with a fixed gauge, which covariances follow from.
 
-    After each estimate of the noise one Gauss-Newton step goes to the minimum under it. The states
-    that are reported stay those of the given minimum. What images say of them hardly changes on the
-    way, so that their Jacobians remain those of the minimum.
+    After each estimate of the noise one Gauss-Newton step goes to the minimum under it. What images
+    say of the states hardly changes on the way, so that their Jacobians remain those of the given
+    minimum.
 
     Args:
         found: the minimum.

@@ -67,12 +67,15 @@ class ReprojectionCost:
         sigmas_px: (N,) standard deviations of the observations.
         projection: of the rig, with the motions of the keyframes for rolling shutters.
         loss: of the length of a whitened residual.
+        inefficiency: how many observations say as much as one that is independent of the others
+            (`track_correlation.py`).
     """
 
     obs: Observations
     sigmas_px: FloatArray
     projection: RigProjection
     loss: RobustLoss
+    inefficiency: float = 1.0
 
     def at(self, estimates: Estimates) -> Geometry:
         """Poses and features."""
@@ -85,7 +88,7 @@ class ReprojectionCost:
         behind = np.flatnonzero(depths <= 0.0)
         focal = np.array([camera.fx for camera in self.projection.cameras])
         lengths[behind] = np.sqrt(8.0) * focal[self.obs.camera[behind]]
-        return float(np.sum(self.loss.value(lengths / self.sigmas_px)))
+        return float(np.sum(self.loss.value(lengths / self.sigmas_px))) / self.inefficiency
 
     def linearized(self, estimates: Estimates) -> LinearReprojection:
         """Whitened residuals and Jacobians, weighted by the loss."""
@@ -94,7 +97,7 @@ class ReprojectionCost:
         by_pose, by_point, _ = projection.derivatives(obs, at, views)
         residuals = obs.pixels - views.pixels
         lengths = np.hypot(residuals[:, 0], residuals[:, 1]) / self.sigmas_px
-        weights = np.sqrt(self.loss.weights(lengths)) / self.sigmas_px
+        weights = np.sqrt(self.loss.weights(lengths) / self.inefficiency) / self.sigmas_px
         weights[views.in_camera[:, 2] <= 0.0] = 0.0
         residuals *= weights[:, None]
         by_pose *= weights[:, None, None]

@@ -4,7 +4,9 @@
 
 The cost (`recording_factors.py`) is that of the recursive estimators without a window. It is
 minimised by Levenberg-Marquardt: first to a loose tolerance with all observations, then to the end
-without outliers, with features triangulated and IMU samples preintegrated anew.
+without outliers, with features triangulated and IMU samples preintegrated anew. The noise of both
+sensors is read from the residuals at this minimum: how far the errors of tracks are correlated, and
+then how noisy the IMU is. The states are those of the minimum under it.
 """
 
 from __future__ import annotations
@@ -56,6 +58,7 @@ from slam_graph.backend.smoothing.recording_segment import (
 from slam_graph.backend.smoothing.smoothing_config import FinalBaConfig
 from slam_graph.backend.smoothing.state_covariances import with_covariances
 from slam_graph.backend.smoothing.state_elimination import EliminatedStates
+from slam_graph.backend.smoothing.track_correlation import statistical_inefficiency
 from slam_graph.backend.solve.stacked_values import stacked_poses
 from slam_graph.geometry import NavState, Trajectory
 from slam_graph.sensors import Rig
@@ -177,7 +180,7 @@ class BundleAdjustment:
         self._candidates = seen.subset(chosen)
         self._everything = segment.seen.subset(chosen)
         self.iterations = self._passes = 0
-        self._sigma_px = backend.noise.pixel_sigma
+        self._sigma_px, self._inefficiency = backend.noise.pixel_sigma, 1.0
         self._values = values_of(start.states)
         self._given = values_of(start.given or start.states)
         self._factor: EliminatedStates | None = None
@@ -203,6 +206,10 @@ class BundleAdjustment:
             self._learn_pixel_sigma(self._candidates.subset(good), points[good])
         obs, points, variances = self._without_outliers(good, points[good])
         cost, imu_cost = self._minimize(obs, points, variances, self._config.tolerance)
+        if self._config.learn_pixel_sigma and self._learn_inefficiency():
+            points = self._minimum.estimates.points
+            cost, imu_cost = self._minimize(obs, points, variances, self._config.tolerance)
+        inefficiency = self._inefficiency
         figures = AdjustmentFigures(
             keyframes=len(keyframes),
             features=len(obs.ids),
@@ -211,13 +218,16 @@ class BundleAdjustment:
             cost_before=self._cost_before(obs),
             cost_after=cost,
             imu_residual=float(np.sqrt(2.0 * imu_cost / (15 * max(len(keyframes) - 1, 1)))),
-            pixel_residual=float(np.sqrt((cost - imu_cost) / max(len(obs), 1))),
+            pixel_residual=float(np.sqrt((cost - imu_cost) * inefficiency / max(len(obs), 1))),
             pixel_sigma=self._sigma_px,
+            inefficiency=inefficiency,
         )
         states, aligned, equations = self._states(self._segment.stamps_ns), None, None
         try:
             equations = self._equations()
-            states, aligned = with_covariances(states, equations.covariances(), equations.frames)
+            covariances, self._values = equations.covariances(), equations.minimum.values
+            states = self._states(self._segment.stamps_ns)
+            states, aligned = with_covariances(states, covariances, equations.frames)
         except (RuntimeError, np.linalg.LinAlgError) as error:
             logger.info("no covariances: %s", " ".join(str(error).split())[:200])
             equations = None
@@ -269,6 +279,13 @@ class BundleAdjustment:
         sigma_px = float(np.median(lengths)) / _RAYLEIGH_MEDIAN * math.sqrt(2 * len(obs) / freedom)
         configured_px = self._backend.noise.pixel_sigma
         self._sigma_px = float(np.clip(sigma_px, _MIN_SIGMA_RATIO * configured_px, configured_px))
+
+    def _learn_inefficiency(self) -> bool:
+        """Estimate how far errors of tracks are correlated; whether images count less for it."""
+        found = self._minimum
+        linear = found.cost.images.linearized(found.estimates)
+        self._inefficiency = statistical_inefficiency(linear)
+        return self._inefficiency > 1.0
 
     def _without_outliers(
         self, good: BoolArray, points: FloatArray
@@ -325,6 +342,7 @@ class BundleAdjustment:
                 self._sigmas_px(obs) * np.sqrt(variances),
                 self._projection,
                 RobustLoss(self._config.robust_loss, self._config.robust_width),
+                self._inefficiency,
             ),
             len(self._segment.keyframes),
         )

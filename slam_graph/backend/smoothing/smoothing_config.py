@@ -44,10 +44,11 @@ class FinalBaConfig(Settings):
     fuse_features: bool = expert(True)
     """Whether tracks that are found to be of the same point become one feature."""
     learn_pixel_sigma: bool = expert(True)
-    """Whether the noise of the tracks is estimated; noise.pixel_sigma is then an upper bound."""
+    """Whether the noise of the tracks is estimated, with noise.pixel_sigma as an upper bound, and
+    how far it is correlated from keyframe to keyframe. Correlated observations count for less."""
     learn_imu_noise: bool = expert(True)
-    """Whether covariances use the noise of the IMU that residuals show; the calibrated one is a
-    lower bound. The trajectory does not change."""
+    """Whether the noise of the IMU that residuals show is used; the calibrated one is a lower
+    bound."""
     max_iterations: int = expert(20, ge=1)
     """Largest number of Levenberg-Marquardt steps, before outliers are removed and after."""
     tolerance: float = expert(1e-4, gt=0)
