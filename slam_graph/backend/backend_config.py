@@ -132,8 +132,8 @@ class PriorConfig(Settings):
     """Standard deviations of the first state where the data do not determine it."""
 
     attitude_rad: float = expert(0.0025, gt=0)
-    """Roll and pitch, as far as neither the bias nor the scatter of the accelerometer explains their
-    error: 0.025 m/s² in the mean of a platform that is taken to stand still."""
+    """Roll and pitch, as far as neither bias nor scatter of the accelerometer explains their error:
+    0.025 m/s² in the mean of a platform that is taken to stand still."""
     yaw_rad: float = expert(1e-3, gt=0)
     """Yaw, which defines the world frame."""
     position_m: float = expert(1e-3, gt=0)
