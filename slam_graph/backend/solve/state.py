@@ -42,8 +42,8 @@ INDEX_MASK = (1 << _LETTER_SHIFT) - 1
 _COUNT_SHIFT = 16
 _DIMS_BY_CODE = {ord(letter): size for letter, size in DIMS.items()}
 _DISTORTION_CODE = ord("d")
-_FIRST_POINT = L(0)
-_LAST_POINT = _FIRST_POINT + INDEX_MASK
+_FIRST_POINT, _POINT_CODE = L(0), ord("l")
+_POINT_COLUMNS = np.arange(POINT_DIM)
 
 
 def dim(key: int) -> int:
@@ -345,19 +345,21 @@ class _Parts:
 @lru_cache(maxsize=8)
 def _parts(layout: Layout) -> _Parts:
     """The parts of a layout: one is asked for several times in a step."""
-    others, features = _told_apart(layout.dims)
-    starts = [layout.starts[key] for key in landmark_keys(features)]
-    columns = np.array(starts, np.int64)[:, None] + np.arange(POINT_DIM)
-    slices = [slice(layout.starts[key], layout.starts[key] + layout.dims[key]) for key in others]
-    return _Parts(list(zip(others, slices, strict=True)), features, columns)
+    keys = np.fromiter(layout.dims, np.int64, len(layout.dims))
+    dims = np.fromiter(layout.dims.values(), np.int64, len(keys))
+    ends = dims.cumsum()
+    starts, points = ends - dims, keys >> _LETTER_SHIFT == _POINT_CODE
+    columns, rest = starts[points][:, None] + _POINT_COLUMNS, ~points
+    slices = map(slice, starts[rest].tolist(), ends[rest].tolist())
+    others = list(zip(keys[rest].tolist(), slices, strict=True))
+    return _Parts(others, keys[points] - _FIRST_POINT, columns)
 
 
 def _told_apart(keys: Iterable[int]) -> tuple[list[int], IntArray]:
     """Keys of all variables but features, and ids (J,) of the features."""
-    chosen = list(keys)
-    features = [key - _FIRST_POINT for key in chosen if _FIRST_POINT <= key <= _LAST_POINT]
-    others = [key for key in chosen if not _FIRST_POINT <= key <= _LAST_POINT]
-    return others, np.array(features, np.int64)
+    chosen = np.array(keys if isinstance(keys, list) else list(keys), np.int64)
+    points = chosen >> _LETTER_SHIFT == _POINT_CODE
+    return chosen[~points].tolist(), chosen[points] - _FIRST_POINT
 
 
 def _joined(frames: gtsam.Values, ids: IntArray, points: FloatArray) -> gtsam.Values:
@@ -380,6 +382,11 @@ def nav_state_in(
         gyro_bias=np.asarray(bias.gyroscope()),
         covariance=covariance,
     )
+
+
+def features_of(layout: Layout) -> IntArray:
+    """Ids (J,) of the features of a layout, in the order of its columns."""
+    return _parts(layout).features
 
 
 def landmark_keys(ids: IntArray) -> list[int]:
