@@ -18,7 +18,11 @@ BoolArray = NDArray[np.bool_]
 
 def skew(v: FloatArray) -> FloatArray:
     """[v]ₓ (..., 3, 3) of vectors v (..., 3), so that [v]ₓ u = v × u."""
-    return np.cross(v[..., None, :], -np.eye(3))
+    matrix = np.zeros((*v.shape, 3))
+    x, y, z = v[..., 0], v[..., 1], v[..., 2]
+    matrix[..., 2, 1], matrix[..., 0, 2], matrix[..., 1, 0] = x, y, z
+    matrix[..., 1, 2], matrix[..., 2, 0], matrix[..., 0, 1] = -x, -y, -z
+    return matrix
 
 
 def median(values: NDArray[Any]) -> FloatArray:
