@@ -152,7 +152,11 @@ def first_centres(obs: Observations, rig: RigProjection, state: State) -> FloatA
     """Positions (J, 3), in the world, of the cameras that observed each of J features first."""
     rotations, positions = rig.when_taken(obs.frames, *state.poses(obs.frames))
     first = obs.starts[:-1]
-    frames, mounted = obs.frame[first], rig.mounts(obs)[1][first]
+    frames = obs.frame[first]
+    if not rig.rolling:  # few cameras and frames
+        centres = positions[:, None] + rig.body_p_camera @ rotations.transpose(0, 2, 1)
+        return np.asarray(centres[frames, obs.camera[first]])
+    mounted = rig.mounts(obs)[1][first]
     return np.asarray(positions[frames] + np.einsum("jik,jk->ji", rotations[frames], mounted))
 
 
