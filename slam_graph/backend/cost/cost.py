@@ -353,7 +353,8 @@ class Cost:
             obs, observations = self.tracks.obs, linear.tracks
             if tested is not None:
                 obs, observations = obs.subset(tested), observations.subset(tested[obs.feature])
-            root_of_poses = root[:, of_poses - first]
+            above = int(of_poses.min()) - first  # rows that are zero there: the root is triangular
+            root_of_poses = root[above:, of_poses - first]
             covariance = root_of_poses.T @ root_of_poses
             distance = distances_of_tracks(obs, observations, covariance)
             dof = 2 * obs.counts - POINT_DIM

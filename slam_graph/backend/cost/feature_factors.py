@@ -86,7 +86,7 @@ def sum_features(obs: Observations, linear: WhitenedObservations) -> SummedFeatu
     sum_of_features(*parts, obs.frame, obs.starts, R_f, T, information)
     stacked = T.reshape(-1, width)
     information -= stacked.T @ stacked
-    if not np.all(np.isfinite(information)):
+    if not np.isfinite(information).all():
         raise np.linalg.LinAlgError("a feature is not determined by its observations")
     return SummedFeatures(R_f, T[:, :, :-1], T[:, :, -1], information_root(information))
 

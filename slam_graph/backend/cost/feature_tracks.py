@@ -288,8 +288,10 @@ class FeatureTracks:
 
     def frames(self, without: IntArray) -> set[int]:
         """The frames of all waiting observations but those of some features (ascending ids)."""
-        rows = ~self._rows_of_features(without)
-        return set(_numbered(self._frames[rows])[0].tolist())
+        if not len(self):
+            return set()
+        rows, first = ~self._rows_of_features(without), self._frames.min()
+        return set((np.flatnonzero(np.bincount(self._frames[rows] - first)) + first).tolist())
 
     def ids_waiting(self) -> IntArray:
         """All features with waiting observations, ascending."""

@@ -146,7 +146,7 @@ class State:
 
     def copy(self) -> State:
         """An independent copy."""
-        other = State()
+        other = State.__new__(State)
         other.assign(self)
         return other
 
@@ -295,10 +295,10 @@ class State:
 
     def update(self, layout: Layout, delta: FloatArray) -> None:
         """Add an increment (n,) to the tangents at the linearisation points."""
-        parts, moved = _parts(layout), self.offset(layout) + delta
-        self.points = self.points.with_offsets(parts.features, moved[parts.columns])
+        parts = _parts(layout)
+        self.points = self.points.moved(parts.features, delta[parts.columns])
         for key, columns in parts.others:
-            self._offsets[key] = moved[columns]
+            self._offsets[key] = self._offsets[key] + delta[columns]
         tangents = gtsam.VectorValues()
         for key, offset in self._offsets.items():
             tangents.insert(key, offset)
