@@ -369,6 +369,8 @@ def _is_among(frames: IntArray, some: Sequence[int]) -> BoolArray:
 
 def is_in(values: IntArray, ascending: IntArray) -> NDArray[np.bool_]:
     """Which values (N,) are among some ascending ones."""
+    if len(ascending) == 0:
+        return np.zeros(len(values), np.bool_)
     try:
         return are_among(values, ascending)
     except TypeError:  # arrays that cannot be written to, or of other integers
