@@ -93,7 +93,9 @@ class ImuData:
         """Durations (N - 1,) in s between samples, mean rates and specific forces (N - 1, 3)."""
         gyro = 0.5 * (self.gyro[1:] + self.gyro[:-1])
         accel = 0.5 * (self.accel[1:] + self.accel[:-1])
-        durations_s = np.asarray((self.stamps_ns[1:] - self.stamps_ns[:-1]) * 1e-9, dtype=np.float64)
+        durations_s = np.asarray(
+            (self.stamps_ns[1:] - self.stamps_ns[:-1]) * 1e-9, dtype=np.float64
+        )
         return durations_s, gyro, accel
 
 

@@ -241,11 +241,12 @@ def _rayleigh(share: float) -> float:
     return math.sqrt(-2.0 * math.log(1.0 - share))
 
 
-def _by_id(observations: FeatureObservations) -> FeatureObservations:
+def _by_id(seen: FeatureObservations) -> FeatureObservations:
     """The same observations in ascending order of their ids."""
-    order = np.argsort(observations.ids)
-    ids, pixels = observations.ids[order], observations.pixels[order]
-    return FeatureObservations(ids, pixels, observations.normalized[order])
+    if (seen.ids[1:] > seen.ids[:-1]).all():
+        return FeatureObservations(seen.ids, seen.pixels, seen.normalized)
+    order = np.argsort(seen.ids)
+    return FeatureObservations(seen.ids[order], seen.pixels[order], seen.normalized[order])
 
 
 def _common_motion_px(
