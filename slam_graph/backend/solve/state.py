@@ -391,7 +391,7 @@ def features_of(layout: Layout) -> IntArray:
 
 def landmark_keys(ids: IntArray) -> list[int]:
     """Keys of features (J,): GTSAM's symbols have their index in the lowest bits."""
-    keys: list[int] = (ids + L(0)).tolist()
+    keys: list[int] = (ids + _FIRST_POINT).tolist()
     return keys
 
 
