@@ -100,9 +100,11 @@ class VelocityCorrection:
         assert predicted.covariance is not None
         assert state.covariance is not None
         prior, off = predicted.covariance[_VELOCITY, _VELOCITY], state.velocity - predicted.velocity
-        columns = np.empty((3, 4))
+        columns = np.empty((3, 4), order="F")
         columns[:, 0], columns[:, 1:] = off, state.covariance[_VELOCITY, _VELOCITY]
-        solved = np.linalg.solve(prior, columns)
+        _, _, solved, info = lapack.dgesv(prior, columns)
+        if info != 0:
+            raise np.linalg.LinAlgError("the covariance of the predicted velocity is singular")
         expected = 1.0 - float(solved[0, 1] + solved[1, 2] + solved[2, 3]) / 3.0
         return VelocityCorrection(float(off @ solved[:, 0]) / 3.0, max(expected, 0.0))
 

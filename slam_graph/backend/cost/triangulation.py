@@ -167,7 +167,8 @@ def _world_cameras(
     if not rig.rolling:  # few cameras and frames, many observations
         world_R = rotations[:, None] @ rig.body_R_camera
         world_p = positions[:, None] + (rotations[:, None] @ rig.body_p_camera[:, :, None])[..., 0]
-        return world_R[obs.frame, obs.camera], world_p[obs.frame, obs.camera]
+        rows = obs.frame * len(rig.body_R_camera) + obs.camera
+        return world_R.reshape(-1, 3, 3).take(rows, axis=0), world_p.reshape(-1, 3).take(rows, 0)
     body_R = rotations[obs.frame]
     body_R_camera, body_p_camera = rig.mounts(obs)
     world_p = positions[obs.frame] + (body_R @ body_p_camera[:, :, None])[:, :, 0]

@@ -335,11 +335,11 @@ def triangularize(Ab: FloatArray) -> FloatArray:
     if info != 0:
         raise ValueError(f"LAPACK's geqrf rejected argument {-info}")
     triangle = np.zeros((n, n), order="F")
-    np.copyto(triangle, qr[:n], where=_upper(n))
+    np.copyto(triangle, qr[:n], where=upper_triangle(n))
     return triangle
 
 
 @lru_cache(maxsize=64)
-def _upper(n: int) -> BoolArray:
+def upper_triangle(n: int) -> BoolArray:
     """(n, n) where an upper triangle is."""
     return np.asfortranarray(np.tri(n, dtype=np.bool_).T)
