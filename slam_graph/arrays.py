@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""Array types that all modules share, the matrix of the cross product, and medians."""
+"""Array types that all modules share, the matrix of the cross product, sets of ids, and medians."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["BoolArray", "FloatArray", "IntArray", "median", "skew"]
+__all__ = ["BoolArray", "FloatArray", "IntArray", "among", "median", "skew"]
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -18,7 +18,19 @@ BoolArray = NDArray[np.bool_]
 
 def skew(v: FloatArray) -> FloatArray:
     """[v]ₓ (..., 3, 3) of vectors v (..., 3), so that [v]ₓ u = v × u."""
-    return np.cross(v[..., None, :], -np.eye(3))
+    matrix = np.zeros((*v.shape, 3))
+    x, y, z = v[..., 0], v[..., 1], v[..., 2]
+    matrix[..., 2, 1], matrix[..., 0, 2], matrix[..., 1, 0] = x, y, z
+    matrix[..., 1, 2], matrix[..., 2, 0], matrix[..., 0, 1] = -x, -y, -z
+    return matrix
+
+
+def among(values: IntArray, ascending: IntArray) -> BoolArray:
+    """Which values (N,) are among some ascending ones (M,)."""
+    if len(ascending) == 0:
+        return np.zeros(len(values), np.bool_)
+    places = np.minimum(ascending.searchsorted(values), len(ascending) - 1)
+    return np.asarray(ascending[places] == values)
 
 
 def median(values: NDArray[Any]) -> FloatArray:

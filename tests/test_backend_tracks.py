@@ -8,10 +8,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from gtsam.symbol_shorthand import L, X
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from slam_graph.arrays import among
 from slam_graph.backend.cost.feature_tracks import FeatureTracks, Outcome, is_in
+from slam_graph.backend.solve.square_root import Layout, SquareRootInformation
+from slam_graph.backend.solve.state import State, dims_of, imu_state_keys
+from slam_graph.backend.window import Window
 from slam_graph.sensors.measurements import FeatureFrame, FeatureObservations
 
 POINTS = np.random.default_rng(0).uniform([-2.0, -2.0, 3.0], [2.0, 2.0, 9.0], (50, 3))
@@ -47,6 +52,19 @@ def test_ids_of_any_integers_can_be_compared(kind: type) -> None:
     ascending = np.frombuffer(np.array([3, 4, 9], kind).tobytes(), kind)
     assert not values.flags.writeable
     assert is_in(values, ascending).tolist() == [False, True, True]
+    assert among(values, ascending).tolist() == [False, True, True]
+    assert among(values, ascending[:0]).tolist() == [False, False, False]
+    assert among(values[:0], ascending).tolist() == []
+
+
+def test_features_that_are_lost_come_first_and_others_keep_their_order() -> None:
+    layout = Layout(dims_of([L(8), L(3), X(0), L(5), *imu_state_keys(1)]))
+    window = Window(2, 0, State(), SquareRootInformation(layout, np.eye(layout.size + 1)))
+    window.tracks.seen = np.array([2, 3, 5, 9])
+    # of the new features 2, 4 and 9 one is lost already: nothing is known of it
+    keys = window.keys([0, 1], [1], np.array([2, 3, 4, 5, 8, 9]))
+    motion = [*imu_state_keys(1), *imu_state_keys(2)]
+    assert keys == [L(8), L(3), L(5), L(2), L(9), X(0), *motion]
 
 
 def test_the_table_of_outcomes_is_the_code() -> None:

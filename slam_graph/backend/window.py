@@ -9,13 +9,13 @@ from dataclasses import dataclass, field
 
 import gtsam
 import numpy as np
-from gtsam.symbol_shorthand import L, X
+from gtsam.symbol_shorthand import X
 
 from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.backend.cost.feature_tracks import FeatureTracks, is_in
 from slam_graph.backend.marginalization.landmark_store import LandmarkStore
 from slam_graph.backend.solve.square_root import SquareRootInformation
-from slam_graph.backend.solve.state import State, imu_state_keys
+from slam_graph.backend.solve.state import State, features_of, imu_state_keys, landmark_keys
 from slam_graph.geometry import NavState
 
 
@@ -72,11 +72,10 @@ class Window:
         them as they were: what no new measurement touches stands to the left, where an update need
         not go, and what does not change its place is cheap to keep.
         """
-        tracked = is_in(features, self.tracks.seen)
-        lost, live = ({L(int(j)) for j in features[rows]} for rows in (~tracked, tracked))
-        keys = [key for key in self.prior.layout.dims if key in lost]
-        keys += [key for key in self.prior.layout.dims if key in live]
-        keys += sorted(live.difference(self.prior.layout.dims))
+        known = features_of(self.prior.layout)
+        staying, new = known[is_in(known, features)], features[~is_in(features, np.sort(known))]
+        tracked, live = is_in(staying, self.tracks.seen), new[is_in(new, self.tracks.seen)]
+        keys = landmark_keys(np.concatenate([staying[~tracked], staying[tracked], live]))
         keys += self.calibration
         keys += [X(i) for i in past if i not in moving]
         for i in (*moving, self.frame):

@@ -79,7 +79,7 @@ class StateHistory:
         self._stamps_ns.append(state.stamp_ns)
         self._states.extend(row.tolist())
         self._pose_covariances.extend(covariance[_UPPER].tolist())
-        self._other_variances.extend(np.diag(covariance)[_POSE_WIDTH:].tolist())
+        self._other_variances.extend(covariance.diagonal()[_POSE_WIDTH:].tolist())
 
     def extend(self, other: StateHistory) -> None:
         """Add all states of another history, which are later."""

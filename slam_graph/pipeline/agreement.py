@@ -13,7 +13,7 @@ from operator import attrgetter
 
 import numpy as np
 
-from slam_graph.arrays import IntArray
+from slam_graph.arrays import IntArray, among
 from slam_graph.backend import Estimator, Innovations
 from slam_graph.config import RunConfig
 from slam_graph.errors import EstimationError
@@ -63,20 +63,18 @@ def check_sane(state: NavState, config: RunConfig) -> None:
         DivergenceError: naming what is beyond its limit.
     """
     limits = config.limits
-    variances = np.zeros(15) if state.covariance is None else np.diag(state.covariance)
-    pose, biases = state.world_T_body.matrix().ravel(), (state.gyro_bias, state.accel_bias)
-    if not np.isfinite(np.concatenate([pose, state.velocity, *biases, variances])).all():
+    variances = [0.0] * 15 if state.covariance is None else state.covariance.diagonal().tolist()
+    pose, velocity = state.world_T_body.matrix(), state.velocity.tolist()
+    gyro, accel = state.gyro_bias.tolist(), state.accel_bias.tolist()
+    known = (*velocity, *gyro, *accel, *variances)
+    if not (np.isfinite(pose).all() and all(map(math.isfinite, known))):
         raise DivergenceError(f"diverged at frame {state.stamp_ns}: the state is not finite")
-    sigma_m = math.sqrt(max(float(variances[3:6].max()), 0.0))
+    sigma_m = math.sqrt(max(*variances[3:6], 0.0))
     for what, value, limit in (
-        ("speed of {} m/s", float(np.linalg.norm(state.velocity)), limits.max_speed),
+        ("speed of {} m/s", math.hypot(*velocity), limits.max_speed),
         ("position sigma of {} m", sigma_m, limits.max_position_sigma_m),
-        ("gyroscope bias of {} rad/s", float(np.abs(state.gyro_bias).max()), limits.max_gyro_bias),
-        (
-            "accelerometer bias of {} m/s²",
-            float(np.abs(state.accel_bias).max()),
-            limits.max_accel_bias,
-        ),
+        ("gyroscope bias of {} rad/s", max(map(abs, gyro)), limits.max_gyro_bias),
+        ("accelerometer bias of {} m/s²", max(map(abs, accel)), limits.max_accel_bias),
     ):
         if value > limit:
             raise DivergenceError(
@@ -195,10 +193,11 @@ class Corrections:
 
     def note(self, frame: FeatureFrame) -> None:
         """Note whether the tracks of the frame before go on in this one."""
-        ids = np.unique(np.concatenate([seen.ids for seen in frame.cameras]))
+        ids = np.sort(np.concatenate([seen.ids for seen in frame.cameras]))
         if not len(ids):
             return
-        if np.count_nonzero(np.isin(self._ids, ids)) < _FOUND_AGAIN * len(self._ids):
+        ids = ids[np.concatenate([[True], ids[1:] != ids[:-1]])]
+        if np.count_nonzero(among(self._ids, ids)) < _FOUND_AGAIN * len(self._ids):
             self._broken_ns = frame.stamp_ns
         self._ids = ids
 

@@ -9,8 +9,7 @@ where the IMU predicts its start from the last good state; how well that is know
 from __future__ import annotations
 
 from collections import deque
-
-import numpy as np
+from itertools import pairwise
 
 from slam_graph.backend import Estimator
 from slam_graph.diagnostics import Diagnostics
@@ -89,7 +88,8 @@ class Recovery:
             return
         last_ns, stamps = self._recent[-1].stamp_ns, imu.stamps_ns
         between = stamps[(stamps > last_ns) & (stamps < stamp_ns)]  # they may lead beyond the frame
-        blind_s = float(np.max(np.diff([last_ns, *between.tolist(), stamp_ns]))) * 1e-9
+        times_ns = [last_ns, *between.tolist(), stamp_ns]
+        blind_s = max(later - earlier for earlier, later in pairwise(times_ns)) * 1e-9
         if blind_s > _LONGEST_BLIND_S:
             message = f"lost at frame {stamp_ns}: nothing was recorded for {blind_s:.1f} s"
             raise DivergenceError(message)

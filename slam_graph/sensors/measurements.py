@@ -15,7 +15,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from slam_graph.arrays import BoolArray, FloatArray, IntArray
+from slam_graph.arrays import BoolArray, FloatArray, IntArray, among
 from slam_graph.sensors.aiding import AidingData
 
 
@@ -93,13 +93,19 @@ class ImuData:
         """Durations (N - 1,) in s between samples, mean rates and specific forces (N - 1, 3)."""
         gyro = 0.5 * (self.gyro[1:] + self.gyro[:-1])
         accel = 0.5 * (self.accel[1:] + self.accel[:-1])
-        return np.diff(self.stamps_ns) * 1e-9, gyro, accel
+        durations_s = np.asarray(
+            (self.stamps_ns[1:] - self.stamps_ns[:-1]) * 1e-9, dtype=np.float64
+        )
+        return durations_s, gyro, accel
 
 
 def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
     """Cross products (N, 3); NumPy's own takes twice as long for so few rows."""
-    (a0, a1, a2), (b0, b1, b2) = a.T, b.T
-    return np.stack([a1 * b2 - a2 * b1, a2 * b0 - a0 * b2, a0 * b1 - a1 * b0], axis=1)
+    (a0, a1, a2), (b0, b1, b2), product = a.T, b.T, np.empty_like(a)
+    product[:, 0] = a1 * b2 - a2 * b1
+    product[:, 1] = a2 * b0 - a0 * b2
+    product[:, 2] = a0 * b1 - a1 * b0
+    return product
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -239,7 +245,8 @@ class FeatureFrame:
         """The frame without these features."""
         if len(ids) == 0:
             return self
-        cameras = (c.select(~np.isin(c.ids, ids)) for c in self.cameras)
+        ascending = np.sort(ids)
+        cameras = (c.select(~among(c.ids, ascending)) for c in self.cameras)
         return FeatureFrame(self.stamp_ns, tuple(cameras))
 
 

@@ -155,8 +155,8 @@ class DensityScales:
         memory = math.exp(-dt_s / PERSISTENCE_TIME_S)
         directions = memory * self._directions + math.sqrt(1.0 - memory**2) * white
         memory = math.exp(-dt_s / SIZE_TIME_S)
-        sizes = memory * self._sizes + (1.0 - memory) * np.sum(white * white, axis=1) / 3.0
-        persistence = np.sum(directions * directions, axis=1) / 3.0
+        sizes = memory * self._sizes + (1.0 - memory) * np.add.reduce(white * white, axis=1) / 3.0
+        persistence = np.add.reduce(directions * directions, axis=1) / 3.0
         surprise = np.minimum(np.minimum(persistence, sizes), _MAX_SQUARE) - 1.0
         responses_s = np.where(surprise > 0.0, RESPONSE_TIME_S, self.fall_times_s)
         factors = self.factors * np.exp(0.5 * surprise * dt_s / responses_s)

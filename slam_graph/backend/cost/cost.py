@@ -119,7 +119,6 @@ class Cost:
     loss: RobustLoss | None = None
     sigma_px: FloatArray | None = None
     _layout: tuple[tuple[object, ...], Layout] | None = field(default=None, init=False)  # the last
-    _columns: tuple[tuple[object, ...], NDArray[np.intp]] | None = field(default=None, init=False)
 
     @property
     def robust(self) -> RobustLoss:
@@ -279,8 +278,7 @@ class Cost:
         if linear.landmarks is not None and self.landmarks is not None:
             obs = self.landmarks
             of_state = layout.indices(self.rig.keys_of(obs))
-            own = np.zeros(len(obs.ids), np.int64)
-            own[obs.feature] = self._state_columns(obs, layout)[:, POSE_DIM]
+            own = _starts_of_points(obs, layout)
             leading, rest = state_feature_rows(obs, linear.landmarks, own, of_state, size)
         if linear.tracks is None or self.tracks is None:
             return [leading, pose_rows(rest, None, none, none, (of_state, none), size)]
@@ -355,7 +353,8 @@ class Cost:
             obs, observations = self.tracks.obs, linear.tracks
             if tested is not None:
                 obs, observations = obs.subset(tested), observations.subset(tested[obs.feature])
-            root_of_poses = root[:, of_poses - first]
+            above = int(of_poses.min()) - first  # rows that are zero there: the root is triangular
+            root_of_poses = root[above:, of_poses - first]
             covariance = root_of_poses.T @ root_of_poses
             distance = distances_of_tracks(obs, observations, covariance)
             dof = 2 * obs.counts - POINT_DIM
@@ -378,19 +377,20 @@ class Cost:
 
     def _state_columns(self, obs: Observations, layout: Layout) -> NDArray[np.intp]:
         """Columns (N, 9 + C) of each observation: its pose, its feature, and the calibration."""
-        if self._columns is not None and _are_same(self._columns[0], (obs, layout)):
-            return self._columns[1]
         poses = np.array([layout.starts[X(i)] for i in obs.frames])
-        points = np.array([layout.starts.get(key, 0) for key in landmark_keys(obs.ids)])
+        points = _starts_of_points(obs, layout)
         calibration = layout.indices(self.rig.common_keys)
-        parts = (
-            poses[obs.frame][:, None] + np.arange(6),
-            points[obs.feature][:, None] + np.arange(POINT_DIM),
-            np.broadcast_to(calibration, (len(obs), len(calibration))),
-        )
-        columns = np.concatenate(parts, axis=1)
-        self._columns = (obs, layout), columns
+        own = POSE_DIM + POINT_DIM
+        columns = np.empty((len(obs), own + len(calibration)), np.intp)
+        columns[:, :POSE_DIM] = poses[obs.frame][:, None] + np.arange(POSE_DIM)
+        columns[:, POSE_DIM:own] = points[obs.feature][:, None] + np.arange(POINT_DIM)
+        columns[:, own:] = calibration
         return columns
+
+
+def _starts_of_points(obs: Observations, layout: Layout) -> NDArray[np.intp]:
+    """The first column (J,) of each feature of the state; 0 of others, which have no rows."""
+    return np.array([layout.starts.get(key, 0) for key in landmark_keys(obs.ids)], np.intp)
 
 
 def _are_same(some: tuple[object, ...], others: tuple[object, ...]) -> bool:

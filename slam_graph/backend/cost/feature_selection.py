@@ -168,5 +168,7 @@ def seen_by_leaving(tracks: FeatureTracks, past: Sequence[int], poses: PoseSelec
 
 def _longest(ids: IntArray, lengths: IntArray, count: int) -> IntArray:
     """The `count` features with the longest tracks, ascending ids."""
+    if count >= len(ids):
+        return ids
     order = np.argsort(-lengths, kind="stable")[:count]
     return np.sort(ids[order])

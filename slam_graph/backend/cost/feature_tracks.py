@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 
 import numpy as np
@@ -42,6 +42,8 @@ class Observations:
     camera: IntArray
     pixels: FloatArray
     normalized: FloatArray
+    _starts: IntArray | None = field(default=None, init=False)
+    _counts: IntArray | None = field(default=None, init=False)
 
     def __len__(self) -> int:
         return len(self.feature)
@@ -49,12 +51,20 @@ class Observations:
     @property
     def counts(self) -> IntArray:
         """(J,) number of observations of each feature."""
-        return np.bincount(self.feature, minlength=len(self.ids))
+        if self._counts is None:  # it is asked for many times in a step
+            counts = np.bincount(self.feature, minlength=len(self.ids))
+            object.__setattr__(self, "_counts", counts)
+        assert self._counts is not None
+        return self._counts
 
     @property
     def starts(self) -> IntArray:
         """(J + 1,) first observation of each feature, and N."""
-        return np.searchsorted(self.feature, np.arange(len(self.ids) + 1))
+        if self._starts is None:
+            starts = self.feature.searchsorted(np.arange(len(self.ids) + 1))
+            object.__setattr__(self, "_starts", starts)
+        assert self._starts is not None
+        return self._starts
 
     @property
     def slots(self) -> IntArray:
@@ -278,8 +288,10 @@ class FeatureTracks:
 
     def frames(self, without: IntArray) -> set[int]:
         """The frames of all waiting observations but those of some features (ascending ids)."""
-        rows = ~self._rows_of_features(without)
-        return set(_numbered(self._frames[rows])[0].tolist())
+        if not len(self):
+            return set()
+        rows, first = ~self._rows_of_features(without), self._frames.min()
+        return set((np.flatnonzero(np.bincount(self._frames[rows] - first)) + first).tolist())
 
     def ids_waiting(self) -> IntArray:
         """All features with waiting observations, ascending."""
@@ -357,6 +369,8 @@ def _is_among(frames: IntArray, some: Sequence[int]) -> BoolArray:
 
 def is_in(values: IntArray, ascending: IntArray) -> NDArray[np.bool_]:
     """Which values (N,) are among some ascending ones."""
+    if len(ascending) == 0:
+        return np.zeros(len(values), np.bool_)
     try:
         return are_among(values, ascending)
     except TypeError:  # arrays that cannot be written to, or of other integers

@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import B, V, X
+from scipy.linalg import lapack
 
 from slam_graph.arrays import FloatArray
 from slam_graph.backend.aiding.aiding_factors import Aiding
@@ -39,6 +40,8 @@ counts."""
 _VELOCITY = slice(6, 9)
 """Rows of a state's covariance."""
 _UNIT = np.eye(15)
+_BEFORE, _AFTER = np.r_[0:9, 18:24], np.r_[9:18, 24:30]
+"""Columns of the two states of a dynamics factor: poses and velocities come before the biases."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -60,8 +63,11 @@ class _Transition:
         """That of a factor at the values of its states."""
         A, _ = gtsam.JacobianFactor(factor.linearize(values)).jacobian()
         # A_before e + A_after e' is white noise of 1
-        right = np.concatenate([-A[:, :9], -A[:, 18:24], _UNIT], axis=1)
-        solved = np.linalg.solve(np.concatenate([A[:, 9:18], A[:, 24:]], axis=1), right)
+        right = np.zeros((15, 30), order="F")
+        right[:, :15], right[:, 15:] = -A[:, _BEFORE], _UNIT
+        _, _, solved, info = lapack.dgesv(A[:, _AFTER], right, overwrite_b=True)
+        if info != 0:
+            raise np.linalg.LinAlgError("the dynamics do not determine the later state")
         return _Transition(solved[:, :15], solved[:, 15:])
 
     def predicted(self, covariance: FloatArray) -> FloatArray:
@@ -98,10 +104,13 @@ class VelocityCorrection:
         assert predicted.covariance is not None
         assert state.covariance is not None
         prior, off = predicted.covariance[_VELOCITY, _VELOCITY], state.velocity - predicted.velocity
-        columns = np.column_stack([off, state.covariance[_VELOCITY, _VELOCITY]])
-        solved = np.linalg.solve(prior, columns)
-        expected = 1.0 - float(np.trace(solved[:, 1:])) / len(off)
-        return VelocityCorrection(float(off @ solved[:, 0]) / len(off), max(expected, 0.0))
+        columns = np.empty((3, 4), order="F")
+        columns[:, 0], columns[:, 1:] = off, state.covariance[_VELOCITY, _VELOCITY]
+        _, _, solved, info = lapack.dgesv(prior, columns)
+        if info != 0:
+            raise np.linalg.LinAlgError("the covariance of the predicted velocity is singular")
+        expected = 1.0 - float(solved[0, 1] + solved[1, 2] + solved[2, 3]) / 3.0
+        return VelocityCorrection(float(off @ solved[:, 0]) / 3.0, max(expected, 0.0))
 
 
 class Propagation:

@@ -108,10 +108,9 @@ class PixelNoise:
         self._stamp_ns = stamp_ns
         if tracks is None:
             return
-        known = tracks.subset(tracks.obs.counts >= _MIN_OBSERVATIONS)
-        if len(known.obs) == 0:
-            return
-        known = known.subset(_extents_px(known.obs, len(self.sigma_px)) >= _LEAST_MOTION_PX)
+        telling = tracks.obs.counts >= _MIN_OBSERVATIONS
+        telling &= _extents_px(tracks.obs, len(self.sigma_px)) >= _LEAST_MOTION_PX
+        known = tracks.subset(telling)
         if len(known.obs) == 0:
             return
         parts = _whitened(cost, known, self.sigma_px)

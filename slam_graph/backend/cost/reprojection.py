@@ -38,6 +38,7 @@ from slam_graph.kernels.projection import chain_rule, distort_radtan, to_cameras
 from slam_graph.sensors import Camera, FeatureFrame, Rig
 
 _STILL = FrameMotion(np.zeros(6), 0.0)
+_FIRST_POSE = X(0)
 
 MIN_DEPTH = 1e-3
 """Points nearer than this (m) are projected as if at this depth; depth checks reject them."""
@@ -133,7 +134,7 @@ class RigProjection:
 
     def keys_of(self, obs: Observations) -> list[int]:
         """Keys of all variables beside the features that observations depend on."""
-        return [*(X(i) for i in obs.frames), *self.common_keys]
+        return [*(_FIRST_POSE + i for i in obs.frames), *self.common_keys]
 
     def poses(self, values: gtsam.Values, frames: Iterable[int]) -> tuple[FloatArray, FloatArray]:
         """Rotations (F, 3, 3) and positions (F, 3) of the body when some frames were taken."""

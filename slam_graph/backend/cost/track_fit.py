@@ -40,6 +40,7 @@ Reported poses are causal: over a second they are off by a good part of that noi
 _UNEVEN_NS = 5_000_000
 """Frames come earlier or later by up to so much."""
 _POINT_DIM = 3
+_THRESHOLDS = TriangulationConfig()
 _GOOD_SHARE, _JUMPED_SHARE, _JUMPED = 0.3, 0.8, 20
 """At a jump the share that does not fit was at most the first before; then at least the second does
 not fit across it, and fits after it; of so many tracks."""
@@ -182,7 +183,7 @@ class TrackFit:
         poses = [pose for pose in self._poses if pose.index in obs.frames]
         R = np.array([pose.rotation for pose in poses])
         p = np.array([pose.position for pose in poses])
-        found = triangulate(obs, projection, R, p, TriangulationConfig())
+        found = triangulate(obs, projection, R, p, _THRESHOLDS)
         dof = np.maximum(2 * obs.counts - _POINT_DIM, 1)
         errors: FloatArray = found.reprojection_px * np.sqrt(obs.counts / dof)
         return np.where(np.isfinite(errors), errors, np.inf)

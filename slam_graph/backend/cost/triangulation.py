@@ -152,7 +152,11 @@ def first_centres(obs: Observations, rig: RigProjection, state: State) -> FloatA
     """Positions (J, 3), in the world, of the cameras that observed each of J features first."""
     rotations, positions = rig.when_taken(obs.frames, *state.poses(obs.frames))
     first = obs.starts[:-1]
-    frames, mounted = obs.frame[first], rig.mounts(obs)[1][first]
+    frames = obs.frame[first]
+    if not rig.rolling:  # few cameras and frames
+        centres = positions[:, None] + rig.body_p_camera @ rotations.transpose(0, 2, 1)
+        return np.asarray(centres[frames, obs.camera[first]])
+    mounted = rig.mounts(obs)[1][first]
     return np.asarray(positions[frames] + np.einsum("jik,jk->ji", rotations[frames], mounted))
 
 
@@ -163,7 +167,8 @@ def _world_cameras(
     if not rig.rolling:  # few cameras and frames, many observations
         world_R = rotations[:, None] @ rig.body_R_camera
         world_p = positions[:, None] + (rotations[:, None] @ rig.body_p_camera[:, :, None])[..., 0]
-        return world_R[obs.frame, obs.camera], world_p[obs.frame, obs.camera]
+        rows = obs.frame * len(rig.body_R_camera) + obs.camera
+        return world_R.reshape(-1, 3, 3).take(rows, axis=0), world_p.reshape(-1, 3).take(rows, 0)
     body_R = rotations[obs.frame]
     body_R_camera, body_p_camera = rig.mounts(obs)
     world_p = positions[obs.frame] + (body_R @ body_p_camera[:, :, None])[:, :, 0]

@@ -144,15 +144,17 @@ class StandstillDetector:
 
         Even motion cancels in them, and their median is that of motion that all features share.
         """
-        frames = [self._recent[k][1] for k in (-3, -2, -1)]
-        ids = frames[0].ids
-        for others in frames[1:]:
-            ids = ids[is_in(ids, others.ids)]
-        ids = ids[~is_in(ids, self.dynamic)]
-        if len(ids) < MIN_FEATURES:
+        first, second, third = (self._recent[k][1] for k in (-3, -2, -1))
+        if min(len(first), len(second), len(third)) < MIN_FEATURES:
             return None
-        first, second, third = (frame.pixels[np.searchsorted(frame.ids, ids)] for frame in frames)
-        change = third - 2.0 * second + first
+        ids, common = first.ids, ~is_in(first.ids, self.dynamic)
+        places = [np.minimum(f.ids.searchsorted(ids), len(f) - 1) for f in (second, third)]
+        for frame, rows in zip((second, third), places, strict=True):
+            common &= frame.ids[rows] == ids
+        if np.count_nonzero(common) < MIN_FEATURES:
+            return None
+        change = third.pixels[places[1][common]] + first.pixels[common]
+        change -= 2.0 * second.pixels[places[0][common]]
         change -= median(change)
         # a second difference of independent errors has the variance (1 + 4 + 1) σ²
         return float(median(np.abs(change).ravel())) / (_NORMAL_MEDIAN * math.sqrt(6.0))
@@ -239,11 +241,12 @@ def _rayleigh(share: float) -> float:
     return math.sqrt(-2.0 * math.log(1.0 - share))
 
 
-def _by_id(observations: FeatureObservations) -> FeatureObservations:
+def _by_id(seen: FeatureObservations) -> FeatureObservations:
     """The same observations in ascending order of their ids."""
-    order = np.argsort(observations.ids)
-    ids, pixels = observations.ids[order], observations.pixels[order]
-    return FeatureObservations(ids, pixels, observations.normalized[order])
+    if (seen.ids[1:] > seen.ids[:-1]).all():
+        return FeatureObservations(seen.ids, seen.pixels, seen.normalized)
+    order = np.argsort(seen.ids)
+    return FeatureObservations(seen.ids[order], seen.pixels[order], seen.normalized[order])
 
 
 def _common_motion_px(

@@ -70,14 +70,18 @@ def align(
         None if the equations do not determine a solution.
     """
     weights = np.ones(len(obs))
-    alignment = None
-    for _ in range(1 + _REWEIGHTINGS):
-        A, b = _reduced_equations(obs, motion, rig, weights)
+    for rounds_left in reversed(range(1 + _REWEIGHTINGS)):
+        by_point, by_motion, b = alignment_equations(obs, motion, rig, weights)
+        others = np.concatenate([by_motion, b[:, :, None]], axis=2)
+        R, eliminated = eliminate_points(obs, by_point, others)
+        rest = eliminated[:, 3:].reshape(-1, 7)
         try:
-            alignment = constrained_solution(A, b, gravity)
+            alignment = constrained_solution(rest[:, :6], rest[:, 6], gravity)
         except (np.linalg.LinAlgError, ValueError):
             return None
-        weights = 1.0 / _depths(obs, motion, rig, alignment, weights)
+        if not rounds_left:
+            break
+        weights = 1.0 / _depths(obs, motion, rig, alignment, (R, eliminated[:, :3]))
     return alignment
 
 
@@ -105,24 +109,26 @@ def alignment_equations(
     return by_point, by_motion, b
 
 
-def _reduced_equations(
-    obs: Observations, motion: Motion, rig: RigProjection, weights: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """The equations (rows, 6) and right-hand sides (rows,) that no longer contain the features."""
-    by_point, by_motion, b = alignment_equations(obs, motion, rig, weights)
-    _, eliminated = eliminate_points(obs, by_point, np.concatenate([by_motion, b[:, :, None]], 2))
-    rest = eliminated[:, 3:].reshape(-1, 7)
-    return rest[:, :6], rest[:, 6]
-
-
 def _depths(
-    obs: Observations, motion: Motion, rig: RigProjection, found: Alignment, weights: FloatArray
+    obs: Observations,
+    motion: Motion,
+    rig: RigProjection,
+    found: Alignment,
+    of_points: tuple[FloatArray, FloatArray],
 ) -> FloatArray:
-    """Depths (N,) of the features in their cameras under an alignment."""
-    by_point, by_motion, b = alignment_equations(obs, motion, rig, weights)
-    rest = b - by_motion @ np.concatenate([found.velocity, found.gravity])
-    R, right = eliminate_points(obs, by_point, rest[:, :, None])
-    points = np.linalg.solve(R + 1e-9 * np.eye(3), right[:, :3])[:, :, 0]
+    """Depths (N,) of the features in their cameras under an alignment.
+
+    Args:
+        obs: N observations of J features.
+        motion: inertial motion between the frames.
+        rig: mounting of the cameras.
+        found: velocity and gravity.
+        of_points: the equations for the features: their triangular coefficients (J, 3, 3), and
+            those of velocity and gravity with the right-hand side (J, 3, 7).
+    """
+    R, others = of_points
+    right = others @ np.concatenate([-found.velocity, -found.gravity, [1.0]])
+    points = np.linalg.solve(R + 1e-9 * np.eye(3), right[:, :, None])[:, :, 0]
     p = found.positions(motion)[obs.frame]
     in_body = np.einsum("nji,nj->ni", motion.rotations[obs.frame], points[obs.feature] - p)
     body_R_camera, body_p_camera = rig.mounts(obs)

@@ -105,6 +105,8 @@ class LandmarkStore:
             self._conditionals.clear()
             self._places.clear()
             self._moved.clear()
+        if not self._places:
+            return np.zeros(0, np.int64)
         return np.array([j for j in seen.tolist() if j in self._places], dtype=np.int64)
 
     def recall(

@@ -182,8 +182,8 @@ def marginalize(
     Returns:
         The prior as a function of the offsets of the estimates from their linearisation points.
     """
-    staying = set(keep)
-    conditional, prior = posterior.divided([key for key in keep if key in posterior.layout])
+    staying, known = set(keep), posterior.layout.dims
+    conditional, prior = posterior.divided([key for key in keep if key in known])
     if store is not None:
         store.put(conditional, state)
     state.remove([key for key in state.variables() if key not in staying])

@@ -85,13 +85,13 @@ class PointTable:
             self.ids[stays], self.first[stays], self.offsets[stays], self.frozen[stays]
         )
 
-    def with_offsets(self, ids: IntArray, offsets: FloatArray) -> PointTable:
-        """With other offsets (N, 3) of some features."""
+    def moved(self, ids: IntArray, increments: FloatArray) -> PointTable:
+        """With the estimates of some features moved by (N, 3); each is named once."""
         if len(ids) == 0:
             return self
         changed = self.offsets.copy()
-        changed[self.rows(ids)] = offsets
-        return replace(self, offsets=changed)
+        changed[self.rows(ids)] += increments
+        return PointTable(self.ids, self.first, changed, self.frozen)
 
     def with_frozen(self, ids: IntArray) -> PointTable:
         """With the linearisation points of some features held where they are."""

@@ -266,11 +266,12 @@ class SquareRootInformation:
         gone = Layout({k: d for k, d in self.layout.dims.items() if k not in staying})
         kept = Layout({k: self.layout.dims[k] for k in keep})
         Rd = np.zeros((kept.size + 1, kept.size + 1), order="F")
-        order = np.append(self.layout.indices([*gone.dims, *keep]), self.layout.size)
+        end = np.array([self.layout.size], np.intp)
+        order = np.concatenate([self.layout.indices([*gone.dims, *keep]), end])
         lead, w = self._unmoved(keep), gone.size
         lead_gone = int(np.searchsorted(order[:w], lead))
         top = lead - lead_gone  # the rows of the marginal that come from the leading ones
-        tail = np.append(np.arange(lead_gone, w), np.arange(w + top, len(order)))
+        tail = np.concatenate([np.arange(lead_gone, w), np.arange(w + top, len(order))])
         triangle = triangularize(self.Rd[lead:, order[tail]])
         Rd[top:, top:] = triangle[w - lead_gone :, w - lead_gone :]
         carried = np.zeros((w, len(order)))
@@ -334,11 +335,11 @@ def triangularize(Ab: FloatArray) -> FloatArray:
     if info != 0:
         raise ValueError(f"LAPACK's geqrf rejected argument {-info}")
     triangle = np.zeros((n, n), order="F")
-    np.copyto(triangle, qr[:n], where=_upper(n))
+    np.copyto(triangle, qr[:n], where=upper_triangle(n))
     return triangle
 
 
 @lru_cache(maxsize=64)
-def _upper(n: int) -> BoolArray:
+def upper_triangle(n: int) -> BoolArray:
     """(n, n) where an upper triangle is."""
     return np.asfortranarray(np.tri(n, dtype=np.bool_).T)
