@@ -123,9 +123,15 @@ def _noise(covariance: FloatArray, robust: bool) -> gtsam.noiseModel.Base:
     return noise
 
 
-def fixes_of(data: AidingData, config: BackendConfig) -> list[Fix]:
-    """Absolute measurements of a stretch of time: positions by the fixes, then the known poses."""
-    arm = np.array(config.gnss.lever_arm_m)
+def fixes_of(data: AidingData, config: BackendConfig, arm_m: FloatArray | None = None) -> list[Fix]:
+    """Absolute measurements of a stretch of time: positions by the fixes, then the known poses.
+
+    Args:
+        data: with times on the clock of the estimate.
+        config: lever arms and the mounting of the sensor of known poses.
+        arm_m: (3,) lever arm of the position fixes, where it is not that of the settings.
+    """
+    arm = np.array(config.gnss.lever_arm_m) if arm_m is None else arm_m
     rows = zip(data.fix_stamps_ns.tolist(), data.fix_positions, data.fix_covariances, strict=True)
     fixes: list[Fix] = [PositionFix(*row, arm) for row in rows]
     arm = np.array(config.known_poses.lever_arm_m)
