@@ -5,7 +5,8 @@
 The estimator begins in a world of its own. It waits until the absolute measurements along its path
 tell where that world is (`world_alignment.py`), and moves everything there once. From then on each
 of them is a factor at the frame that follows it, and of lever arm and clock where these are
-variables (`fix_calibration.py`). Odometry is a factor between consecutive frames from the beginning.
+variables (`fix_calibration.py`). Odometry is a factor between consecutive frames from the
+beginning.
 """
 
 from __future__ import annotations
@@ -50,7 +51,8 @@ _UNTIMED, _MOST_UNTIMED = 0.5, 40
 estimated lever arm is, in σ of a fix, at most; with so many fixes they are taken as they are, as on
 a straight road at an even speed nothing tells them."""
 _REVISED_M, _REVISED_NS = 0.01, 1_500_000_000
-"""Lever arm and clock that move the body by more than this in the world have moved it for so long."""
+"""Where lever arm and clock change by so much in one step that they move the body by more than this
+in the world, poses of before are elsewhere than those of after, for so long."""
 _HISTORY_NS = 5_000_000_000
 """How long odometry and states are kept."""
 

@@ -8,8 +8,8 @@ the covariance that the alignment gives them, and are never marginalized. Variab
 clock, lever arm everywhere.
 
 A fix z between two frames is seen from one of them. With m, Q the pose of the body at its time in
-that frame, u the velocity of the antenna there (in axes of the body), a the lever arm and τ the time
-offset, which was τ₀ when m, Q were taken,
+that frame, u the velocity of the antenna there (in axes of the body), a the lever arm and τ the
+time offset, which was τ₀ when m, Q were taken,
 
     q(a, τ) = m + Q a + u (τ - τ₀),    e = R q + p - z.
 """
@@ -116,14 +116,14 @@ class SeenFixes:
         )
 
     def in_body(self, calibration: FloatArray) -> FloatArray:
-        """q (N, 3): where the antenna was, seen from the poses, by time offset and arm (4,)."""
+        """Where the antenna was (N, 3), seen from the poses: q, by time offset and arm (4,)."""
         late = float(calibration[0]) - self.time_offset_s
         return self.places + self.turns @ calibration[_ARM] + late * self.rates
 
     def residuals(
         self, rotations: FloatArray, positions: FloatArray, calibration: FloatArray
     ) -> FloatArray:
-        """e (N, 3), m.
+        """What the fixes are off (N, 3): e, m.
 
         Args:
             rotations: (N, 3, 3) world_R_body of the poses.
