@@ -266,6 +266,7 @@ class RunResult(RunSummary):
                     "datum": asked.datum,
                     "fix_offset_s": self.fix_offset_s,
                 }
+                | ({"of_truth": asked.truth_of_fixes} if self.georeferenced else {})
                 | ({} if self.fix_calibration is None else self.fix_calibration.table()),
                 "extent": extent | tables.world_table(self.history, self.start_was_given),
                 "segments": tables.segments_table(
