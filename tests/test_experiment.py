@@ -78,6 +78,26 @@ def test_without_an_imu_errors_are_aligned_in_what_nothing_measured(
     assert (tmp_path / "figures" / "sim_random_errors.png").is_file()
 
 
+def test_errors_in_the_world_of_the_fixes_are_beside_the_aligned_ones(tmp_path: Path) -> None:
+    """Yaw and position are not aligned there: both are the error of the run and of its world."""
+    found = compare_algorithms(
+        "sim:random",
+        "msckf",
+        seeds=[4],
+        output=tmp_path,
+        simulation=["duration_s=8", "rate_hz=10", "tracks.features=60", "gnss.sigma_m=0.05",
+                    "gnss.rate_hz=5"],
+        overrides=["backend.initialization.mode=motion"],
+    )  # fmt: skip
+    (row,), (titles, cells) = found.rows, found.table
+    there = row["in_world_of_fixes"]
+    assert there["ate_m"] == row["ate_m"]["none"]
+    assert row["ate_m"]["yaw"] < there["ate_m"] < 0.2
+    shown = dict(zip(titles, cells, strict=True))
+    assert shown["ATE world of fixes [m]"] == shown["ATE none [m]"]
+    assert float(shown["orientation world of fixes [deg]"]) > 0.0
+
+
 def test_every_algorithm_is_in_the_report_with_its_numbers(simulated: tuple[Path, dict]) -> None:
     folder, printed = simulated
     assert [(row["data"], row["algorithm"]) for row in printed["rows"]] == [

@@ -25,7 +25,8 @@ from slam_graph.datasets.streams.aiding_files import read_fixes
 from slam_graph.datasets.streams.geodesy import geodetic_positions, local_positions
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import DataError
-from slam_graph.evaluation import ape
+from slam_graph.evaluation import ape, is_in_world_of_fixes
+from slam_graph.geometry import Similarity
 from slam_graph.results import RunResult
 from slam_graph.sensors import AidingData, FeatureFrame
 from slam_graph.simulation import simulate
@@ -385,3 +386,18 @@ def test_the_final_adjustment_is_in_the_world_of_the_fixes() -> None:
     causal = ape(sequence.groundtruth(), result.trajectory, alignment="none").statistics.rmse
     assert smoothed < 0.75 * causal
     assert smoothed < 0.8
+
+
+def test_a_truth_is_in_the_world_of_the_fixes_or_not() -> None:
+    """Lever arm and noise do not hide it, and a turn by ten degrees does not pass."""
+    gnss = {"sigma_m": 1.0, "rate_hz": 2.0, "lever_arm_m": (0.5, 0.0, 1.0), "multipath": 0.2}
+    sequence = drive(40.0, gnss=gnss)
+    truth = sequence.groundtruth()
+    assert truth is not None
+    assert is_in_world_of_fixes(truth, sequence.aiding)
+    turned = Similarity(Rotation.from_euler("z", 10, degrees=True).as_matrix(), np.zeros(3), 1.0)
+    moved = Similarity(np.eye(3), np.array([20.0, 0.0, 0.0]), 1.0)
+    assert not is_in_world_of_fixes(turned.apply(truth), sequence.aiding)
+    assert not is_in_world_of_fixes(moved.apply(truth), sequence.aiding)
+    assert not is_in_world_of_fixes(None, sequence.aiding)
+    assert not is_in_world_of_fixes(truth, AidingData.empty())

@@ -282,12 +282,15 @@ class GnssConfig(Settings):
     from the datum. Switch it off to compare."""
     lever_arm_m: tuple[float, float, float] = expert((0.0, 0.0, 0.0))
     """Position of the antenna in the body frame, in metres."""
+    lever_arm_sigma_m: float = expert(0.0, ge=0, le=10)
+    """How well that position is known on each axis, in metres. Above zero it is estimated with the
+    states; it needs turns. Not with GTSAM's smoothers."""
     time_offset_s: float = expert(0.0, ge=-10, le=10)
     """Added to the times of the fixes to get them on the clock of the IMU, or of the cameras where
     there is no IMU."""
     time_offset_sigma_s: float = expert(0.0, ge=0, le=1)
     """How well that offset is known, in seconds. Above zero it is estimated from the path, together
-    with the world of the fixes."""
+    with the world of the fixes, and with the states from then on."""
 
 
 class KnownPosesConfig(Settings):

@@ -93,7 +93,7 @@ class Estimator(EstimatorKnowledge):
         if algorithm.engine != "square_root":
             self._make_engine = SmootherEngine
         self._check = StartCalibration(rig, config)
-        self.aiding = Aiding(config, rig.has_imu)
+        self.aiding = Aiding(config, rig.has_imu, algorithm.engine == "square_root")
         self._given: NavState | None = None
         self._before: NavState | None = None
         self._measured = True
@@ -215,7 +215,8 @@ class Estimator(EstimatorKnowledge):
         found = None if self.window is None else self.aiding.alignment(state)
         if self.window is None or found is None:
             return state
-        self.window, self._engine = regauged(self.window, found), self._make_engine(self._context)
+        self.window = regauged(self.window, found, *self.aiding.variables_found(found))
+        self._engine = self._make_engine(self._context)
         self._context.propagation.restart()
         self._start_up.settle()
         self.replayed = self.states = self.aiding.settle(found)

@@ -10,6 +10,7 @@ import gtsam
 import numpy as np
 
 from slam_graph.arrays import FloatArray, IntArray
+from slam_graph.backend.aiding.aiding_factors import Aiding
 from slam_graph.backend.backend_config import BackendConfig
 from slam_graph.backend.cost.track_fit import TrackFit
 from slam_graph.backend.engine_protocol import Engine, EngineContext
@@ -18,7 +19,7 @@ from slam_graph.backend.solve.state import FrameMotion
 from slam_graph.backend.window import Window
 from slam_graph.backend.window_graph import WindowGraph
 from slam_graph.errors import EstimationError
-from slam_graph.sensors import Rig
+from slam_graph.sensors import FixCalibration, Rig
 
 
 class EstimatorKnowledge:
@@ -26,9 +27,11 @@ class EstimatorKnowledge:
 
     Attributes:
         window: the variables and what is known of them; None as long as there is no state.
+        aiding: takes position fixes and odometry up to the next frame.
     """
 
     window: Window | None
+    aiding: Aiding
     _engine: Engine
     _context: EngineContext
     _start_up: StartUp
@@ -105,6 +108,14 @@ class EstimatorKnowledge:
         if self.window is None or not variables.keys:
             return variables.nominal
         return variables.rig(self.window.state.frames)
+
+    @property
+    def fix_calibration(self) -> FixCalibration | None:
+        """Lever arm and clock of the position fixes now; None where they are no variables."""
+        if self.window is None or not self.aiding.aligned:
+            return None
+        information = self._engine.information(self.window)
+        return self.aiding.calibration(self.window.state, information)
 
     def landmarks(self) -> tuple[IntArray, FloatArray]:
         """Ids (N,) and world positions (N, 3) of the features that the last step estimated."""

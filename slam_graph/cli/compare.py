@@ -149,6 +149,7 @@ _SHOWN = {
     "aligned in": "aligned in",
     "ATE [m]": "ATE [m]",
     "orientation [deg]": "rot. [°]",
+    "ATE world of fixes [m]": "of fixes [m]",
     "NEES pose": "NEES",
     "NIS / expected": "NIS",
     "steps": "steps",
@@ -160,6 +161,7 @@ _SHOWN = {
 
 _MEANINGS = {
     "ATE [m]": "ATE, rot.: root mean square errors, aligned in what nothing measured.",
+    "of fixes [m]": "of fixes: ATE in the world of the fixes, not aligned.",
     "NEES": "NEES of the pose (ideal 6).",
     "NIS": "NIS over its expected value (ideal 1).",
 }

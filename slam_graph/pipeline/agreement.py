@@ -318,7 +318,8 @@ class Agreement:
         found = self._fit.add(state, solved, *known, estimator.motion)
         if found is None:
             return
-        if estimator.start_is_doubtful or not found.telling:
+        revised = estimator.aiding.was_revised(state.stamp_ns)
+        if estimator.start_is_doubtful or revised or not found.telling:
             self._motion.untested(state.stamp_ns)
             return
         self._motion.check(state.stamp_ns, found.tested, found.unfit)

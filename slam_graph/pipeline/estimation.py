@@ -166,6 +166,7 @@ class Estimation:
             tracked.frame_stats,
             estimator.aiding.aligned,
             estimator.aiding.offset_s,
+            self._result.fix_calibration,
             imu_noise_at_limit=estimator.imu_noise_at_limit,
         )
         self._note(frame, tracked)
@@ -211,9 +212,10 @@ class Estimation:
             self._recovery.supersede(estimator.replayed)
             result.corrected_rig = estimator.corrected_rig
             result.georeferenced = estimator.aiding.aligned
-            result.fix_offset_s = estimator.aiding.offset_s
             if len(result.segments) < 2:
                 result.start_was_given &= estimator.start_is_given
+        result.fix_calibration = estimator.fix_calibration or result.fix_calibration
+        result.fix_offset_s = estimator.aiding.offset_s
         if state is not None:
             check_sane(state, result.config)
             self._recovery.agreement.check(stamp_ns, estimator.report.innovations)

@@ -16,6 +16,7 @@ from slam_graph.backend import Estimator
 from slam_graph.config import RunConfig, load_config
 from slam_graph.datasets import RecordedSequence, Sequence, open_dataset
 from slam_graph.errors import DataError
+from slam_graph.evaluation import is_in_world_of_fixes
 from slam_graph.frontend import build_frontend
 from slam_graph.interrupts import Interrupts
 from slam_graph.pipeline.estimation import Estimation
@@ -202,12 +203,12 @@ def _part_of(sequence: Sequence, config: RunConfig) -> RunInput:
     rig = replace(rig, has_imu=config.backend.dynamics.uses_imu(recorded))
     if not rig.has_imu:  # gravity is not known
         config = config.with_overrides(["loop_closure.degrees_of_freedom=6"])
-    datum, objects = None, {}
+    datum, objects, truth, of_fixes = None, {}, sequence.groundtruth(), False
     if isinstance(sequence, RecordedSequence):
         datum = sequence.aiding.datum
         objects = sequence.object_truth() if config.objects.enabled else {}
-    truth = sequence.groundtruth()
-    return RunInput(info, config, rig, start_ns, end_ns, truth, datum, objects)
+        of_fixes = is_in_world_of_fixes(truth, config.backend.on_the_clock(sequence.aiding))
+    return RunInput(info, config, rig, start_ns, end_ns, truth, datum, objects, of_fixes)
 
 
 def _tracking(sequence: Sequence, asked: RunInput) -> Tracking:

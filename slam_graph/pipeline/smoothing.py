@@ -63,6 +63,7 @@ class Smoothing(Stage):
             self._log.add(packet.imu, frame.features, frame.imu_noise, aiding)
             self._log.georeferenced = frame.georeferenced
             self._log.fix_offset_s = frame.fix_offset_s
+            self._log.fix_calibration = frame.fix_calibration
         except (OSError, SlamGraphError) as error:
             self._give_up(error)
 

@@ -23,7 +23,7 @@ from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import SlamGraphError
 from slam_graph.frontend import Feedback
 from slam_graph.geometry import NavState
-from slam_graph.sensors import CameraFrame, FeatureFrame, ImuData, Packet, Rig
+from slam_graph.sensors import CameraFrame, FeatureFrame, FixCalibration, ImuData, Packet, Rig
 
 if TYPE_CHECKING:
     from slam_graph.backend import ObjectFrame
@@ -57,6 +57,7 @@ class EstimatedFrame:
         counts: what the front end counts, by name.
         georeferenced: whether the world of the estimate is that of position fixes.
         fix_offset_s: time that was found to be missing from those of the fixes.
+        fix_calibration: lever arm and clock of the fixes, where they are estimated with the states.
         objects: what moves; None where moving objects are not estimated.
         imu_noise_at_limit: whether a noise density of the IMU was raised as far as it may be.
     """
@@ -76,6 +77,7 @@ class EstimatedFrame:
     counts: Mapping[str, float] = field(default_factory=dict)
     georeferenced: bool = False
     fix_offset_s: float = 0.0
+    fix_calibration: FixCalibration | None = None
     objects: ObjectFrame | None = None
     imu_noise_at_limit: bool = False
 

@@ -188,7 +188,8 @@ def final_ba_table(final_ba: FinalBa | None, truth: Trajectory | None) -> Table 
         return None
     accuracy = accuracy_table(truth, final_ba.trajectory, final_ba.history.has_scale)
     nees = consistency_table(truth, final_ba.history, given=False, smoothed=final_ba)
-    return {**asdict(final_ba.summary), "accuracy": accuracy, "nees": nees}
+    fixes = {} if final_ba.fixes is None else {"fixes": final_ba.fixes.table()}
+    return {**asdict(final_ba.summary), "accuracy": accuracy, "nees": nees, **fixes}
 
 
 def loop_closure_table(

@@ -31,6 +31,7 @@ class RunInput:
         truth: ground truth of the whole recording, or None.
         object_truth: true poses of moving objects by their numbers.
         datum: latitude, longitude (°) and height (m) of the origin of the fixes, or None.
+        truth_of_fixes: whether the ground truth is in the world of the position fixes.
     """
 
     info: SequenceInfo
@@ -41,6 +42,7 @@ class RunInput:
     truth: Trajectory | None = None
     datum: tuple[float, float, float] | None = None
     object_truth: Mapping[int, Trajectory] = field(default_factory=dict)
+    truth_of_fixes: bool = False
 
     @property
     def recorded_s(self) -> float:

@@ -37,7 +37,7 @@ from slam_graph.results.run_picture import (
 )
 from slam_graph.results.run_summary import RunSummary
 from slam_graph.results.segments import Segments
-from slam_graph.sensors import Rig
+from slam_graph.sensors import FixCalibration, Rig
 
 if TYPE_CHECKING:
     from slam_graph.backend import FinalBa, MovingObjects, WindowGraph
@@ -63,6 +63,8 @@ class RunResult(RunSummary):
         start_was_given: whether the first state came with the data, in the world of the truth.
         georeferenced: whether the world is that of the position fixes.
         fix_offset_s: time that was found to be missing from those of the fixes.
+        fix_calibration: lever arm and clock of the fixes at the end, where they are estimated with
+            the states.
         corrected_rig: the calibration with which the run began anew; None if it did not.
         point_map: last estimates of the features that were in the state.
         logs: what was noted at every frame.
@@ -83,6 +85,7 @@ class RunResult(RunSummary):
     start_was_given: bool = False
     georeferenced: bool = False
     fix_offset_s: float = 0.0
+    fix_calibration: FixCalibration | None = None
     corrected_rig: Rig | None = None
     point_map: PointMap = field(default_factory=PointMap)
     logs: RunLogs = field(default_factory=RunLogs)
@@ -262,7 +265,9 @@ class RunResult(RunSummary):
                     "of_fixes": self.georeferenced,
                     "datum": asked.datum,
                     "fix_offset_s": self.fix_offset_s,
-                },
+                }
+                | ({"of_truth": asked.truth_of_fixes} if self.georeferenced else {})
+                | ({} if self.fix_calibration is None else self.fix_calibration.table()),
                 "extent": extent | tables.world_table(self.history, self.start_was_given),
                 "segments": tables.segments_table(
                     self.segments, self.trajectory, truth, self.history.has_scale

@@ -4,8 +4,9 @@
 
 The estimator begins in a world of its own. It waits until the absolute measurements along its path
 tell where that world is (`world_alignment.py`), and moves everything there once. From then on each
-of them is a factor at the frame that follows it. Odometry is a factor between consecutive frames
-from the beginning.
+of them is a factor at the frame that follows it, and of lever arm and clock where these are
+variables (`fix_calibration.py`). Odometry is a factor between consecutive frames from the
+beginning.
 """
 
 from __future__ import annotations
@@ -18,6 +19,11 @@ import numpy as np
 
 from slam_graph.arrays import FloatArray
 from slam_graph.backend.aiding.estimated_path import EstimatedPath, variances_of
+from slam_graph.backend.aiding.fix_calibration import (
+    FixVariables,
+    SeenFixes,
+    calibrated_factor,
+)
 from slam_graph.backend.aiding.fix_factors import (
     Fix,
     FixGate,
@@ -29,19 +35,24 @@ from slam_graph.backend.aiding.fix_factors import (
 from slam_graph.backend.aiding.odometry_factors import odometry_factor
 from slam_graph.backend.aiding.world_alignment import WorldAlignment, align_world
 from slam_graph.backend.backend_config import BackendConfig
+from slam_graph.backend.solve.square_root import SquareRootInformation
 from slam_graph.backend.solve.state import State
 from slam_graph.backend.visual_motion import moved_to
 from slam_graph.backend.world_gauge import in_moved_world, with_unknown_gauge
 from slam_graph.geometry import NavState
-from slam_graph.sensors import AidingData
+from slam_graph.sensors import AidingData, FixCalibration
 
 _MOST_FIXES = 300
 """Fixes that are remembered for the alignment."""
 _TIMINGS = 3
 """Alignments, each at the times that the one before has found."""
 _UNTIMED, _MOST_UNTIMED = 0.5, 40
-"""How far the path comes in the standard deviation of an estimated offset, in σ of a fix, at most;
-with so many fixes it is taken as it is, as on a straight road at an even speed nothing tells it."""
+"""How far the path comes in the standard deviation of an estimated offset, and how large that of an
+estimated lever arm is, in σ of a fix, at most; with so many fixes they are taken as they are, as on
+a straight road at an even speed nothing tells them."""
+_REVISED_M, _REVISED_NS = 0.01, 1_500_000_000
+"""Where lever arm and clock change by so much in one step that they move the body by more than this
+in the world, poses of before are elsewhere than those of after, for so long."""
 _HISTORY_NS = 5_000_000_000
 """How long odometry and states are kept."""
 
@@ -52,19 +63,26 @@ class Aiding:
     Args:
         config: settings.
         level: whether gravity is measured.
+        calibrates: whether the engine takes lever arm and clock of the fixes as variables.
 
     Attributes:
         aligned: whether the world is that of the fixes.
         used: whether there was anything to take so far.
         gates: of the sources of fixes, by name.
         offset_s: time that was found to be missing from those of position fixes.
+        arm_m: (3,) lever arm of the position fixes.
+        variables: lever arm and clock, as far as they are estimated with the states.
     """
 
-    def __init__(self, config: BackendConfig, level: bool) -> None:
+    def __init__(self, config: BackendConfig, level: bool, calibrates: bool = True) -> None:
         self._config, self._level = config, level
+        self.variables = FixVariables(config.gnss) if calibrates else None
+        self.arm_m = np.array(config.gnss.lever_arm_m)
         self._data = AidingData.empty()
         self.gates: defaultdict[str, FixGate] = defaultdict(FixGate)
         self.used, self.offset_s, self._offset_sigma_s = False, 0.0, 0.0
+        self._shifted_s = 0.0  # added to the times of fixes that wait
+        self._revised_ns = -_REVISED_NS
         self.restart()
 
     def restart(self) -> None:
@@ -74,11 +92,12 @@ class Aiding:
         self._waiting = self._offered = AidingData.empty()
         self._offered_ns = 0
         self._fixes: list[Fix] = []
+        self._shifted_s = self.offset_s
 
     def add(self, data: AidingData) -> None:
         """Take measurements that follow those before; none say that there will be some."""
         self.used = True
-        data = self._config.on_the_clock(data).shifted(round(self.offset_s * 1e9))
+        data = self._config.on_the_clock(data).shifted(round(self._shifted_s * 1e9))
         self._data = AidingData.concatenate([self._data, data])
         self._waiting = AidingData.concatenate([self._waiting, data])
 
@@ -90,6 +109,7 @@ class Aiding:
         frames: tuple[int, int],
         stamps_ns: tuple[int, int],
         known: FloatArray | None,
+        prior: SquareRootInformation | None = None,
     ) -> list[gtsam.NonlinearFactor]:
         """Factors of what was measured from one frame to the next.
 
@@ -98,6 +118,7 @@ class Aiding:
             frames: indices of the last and the new one.
             stamps_ns: their times.
             known: (6, 6) covariance of the new pose as it is predicted; None if it is not known.
+            prior: on the variables up to the last frame, if lever arm or clock are among them.
         """
         self._data = self._data.within(stamps_ns[0] - _HISTORY_NS, None)
         first, last = (state.frames.atPose3(pose_key(i)) for i in frames)
@@ -108,6 +129,7 @@ class Aiding:
                 factors.append(odometry_factor(frames, moved, self._config.odometry))
         if not self.aligned:
             return factors
+        unknown = self._follow(state, prior)
         for fix in self._due(stamps_ns):
             share = (fix.stamp_ns - stamps_ns[0]) / (stamps_ns[1] - stamps_ns[0])
             then = (
@@ -115,23 +137,102 @@ class Aiding:
             )
             if then is None:
                 continue
-            here = self._of_unsure_time(fix.moved(then, last), (first, last), stamps_ns)
+            here, seen = fix.moved(then, last), None
+            if unknown is not None and isinstance(fix, PositionFix) and fix.is_timed:
+                seen = self._seen(fix, share, then, (first, last), stamps_ns)
+                here = self._of_unsure_sensor(here, seen, last, unknown)
+            else:
+                here = self._of_unsure_time(here, (first, last), stamps_ns)
             weight = 1.0 if known is None else self.gates[fix.source].weight(here, last, known)
-            if weight > 0.0:
-                factors.append(here.factor(pose_key(frames[1]), weight))
+            if weight == 0.0:
+                continue
+            key = pose_key(frames[1])
+            if seen is None or self.variables is None:
+                factors.append(here.factor(key, weight))
+            else:
+                noise, held = fix.covariance / weight, np.append(self.offset_s, self.arm_m)
+                factors.append(calibrated_factor(key, seen, noise, self.variables, held))
         return factors
+
+    def _follow(self, state: State, prior: SquareRootInformation | None) -> FloatArray | None:
+        """Take over lever arm and clock from the state.
+
+        Returns:
+            The covariance (n, n) of those that are variables; None if none are.
+        """
+        variables = self.variables
+        if variables is None or not variables.keys or prior is None:
+            return None
+        found = variables.in_values(state.frames, np.append(self.offset_s, self.arm_m))
+        if self._path.states:
+            last = self._path.states[-1]
+            change_s = abs(float(found[0]) - self.offset_s)
+            change_m = float(np.linalg.norm(found[1:] - self.arm_m))
+            if change_m + change_s * float(np.linalg.norm(last.velocity)) > _REVISED_M:
+                self._revised_ns = last.stamp_ns
+        self.offset_s, self.arm_m = float(found[0]), found[1:]
+        return prior.covariance_of(variables.keys)
+
+    def was_revised(self, stamp_ns: int) -> bool:
+        """Whether lever arm or clock were corrected so much lately that the body has jumped."""
+        return stamp_ns - self._revised_ns < _REVISED_NS
+
+    def calibration(
+        self, state: State, information: SquareRootInformation
+    ) -> FixCalibration | None:
+        """Lever arm and clock now; None if they are no variables.
+
+        Args:
+            state: after a step.
+            information: about an increment of the estimates.
+        """
+        variables = self.variables
+        if variables is None or not variables.keys or not self.aligned:
+            return None
+        covariance = self._follow(state, information)
+        assert covariance is not None
+        return variables.calibration(np.append(self.offset_s, self.arm_m), covariance)
+
+    def _seen(
+        self,
+        fix: PositionFix,
+        share: float,
+        then: gtsam.Pose3,
+        poses: tuple[gtsam.Pose3, gtsam.Pose3],
+        stamps_ns: tuple[int, int],
+    ) -> SeenFixes:
+        """A fix as it is seen from the last of two poses, between which or before which it was."""
+        first, last = poses
+        velocity = self._path.velocity(fix)
+        if share > 0.0:
+            seconds = (stamps_ns[1] - stamps_ns[0]) * 1e-9
+            velocity = (fix.of(last) - fix.of(first)) / seconds
+        return SeenFixes.of([fix], [(then, last)], velocity, self.offset_s)
+
+    def _of_unsure_sensor(
+        self, fix: Fix, seen: SeenFixes, pose: gtsam.Pose3, unknown: FloatArray
+    ) -> Fix:
+        """A fix with the noise that its lever arm and clock add, for the gate."""
+        assert self.variables is not None
+        R = pose.rotation().matrix()[None]
+        J = seen.jacobians(R, np.append(self.offset_s, self.arm_m))[1][0]
+        J = J[:, self.variables.columns]
+        return replace(fix, covariance=fix.covariance + J @ unknown @ J.T)
 
     def _due(self, stamps_ns: tuple[int, int]) -> list[Fix]:
         """The fixes up to a new frame that no frame up to the last one has taken.
 
         GTSAM's smoothers predict frames that they do not keep: what was due for one is due again.
         """
+        later_ns = round((self.offset_s - self._shifted_s) * 1e9)
         since_ns, stamp_ns = stamps_ns
         if self._offered_ns > since_ns:
             self._waiting = AidingData.concatenate([self._offered, self._waiting])
-        self._offered, self._offered_ns = self._waiting.within(None, stamp_ns), stamp_ns
-        self._waiting = self._waiting.within(stamp_ns, None)
-        return fixes_of(self._offered, self._config)
+        waiting = self._waiting.shifted(later_ns)
+        self._offered = waiting.within(None, stamp_ns).shifted(-later_ns)
+        self._offered_ns = stamp_ns
+        self._waiting = waiting.within(stamp_ns, None).shifted(-later_ns)
+        return fixes_of(self._offered.shifted(later_ns), self._config, self.arm_m)
 
     def _of_unsure_time(
         self, fix: Fix, poses: tuple[gtsam.Pose3, gtsam.Pose3], stamps_ns: tuple[int, int]
@@ -186,18 +287,28 @@ class Aiding:
             # older fixes tell less of the world: the path has drifted since
             drifted = [pair.after_drift(*variances_of(state)) for pair in pairs if pair is not None]
             expected_s = -self.offset_s - offset_s
-            found = align_world(drifted, now, self._level, (expected_s, sigma_s))
+            offset = expected_s, sigma_s
+            found = align_world(drifted, now, self._level, offset, self._expected_arm())
             if found is None:
                 return None
             offset_s += found.offset_s
         assert found is not None
-        if self._is_untimed(found, round(offset_s * 1e9)):
+        if self._is_vague(found, round(offset_s * 1e9)):
             return None
         return replace(found, offset_s=offset_s)
 
-    def _is_untimed(self, found: WorldAlignment, offset_ns: int) -> bool:
-        """Whether the clock of the fixes is known so badly that it counts beside their noise."""
-        if found.offset_sigma_s == 0.0:
+    def _expected_arm(self) -> tuple[FloatArray, float] | None:
+        """What is to be added to the lever arm, with its standard deviation; None if it is held."""
+        gnss = self._config.gnss
+        if self.variables is None or gnss.lever_arm_sigma_m == 0.0:
+            return None
+        return np.array(gnss.lever_arm_m) - self.arm_m, gnss.lever_arm_sigma_m
+
+    def _is_vague(self, found: WorldAlignment, offset_ns: int) -> bool:
+        """Whether clock or lever arm are known so badly that they count beside the noise."""
+        gauge = len(found.covariance) + (found.offset_sigma_s > 0.0)
+        of_arm = np.diag(found.joint)[gauge:]
+        if found.offset_sigma_s == 0.0 and not len(of_arm):
             return False
         timed = [
             pair for fix in self._fixes if fix.is_timed and (pair := self._path.at(fix, offset_ns))
@@ -206,7 +317,8 @@ class Aiding:
             return False
         speed = np.mean([np.linalg.norm(pair.velocity) for pair in timed])
         sigma = np.sqrt(np.mean([np.trace(pair.fix.covariance) / 3.0 for pair in timed]))
-        return bool(found.offset_sigma_s * speed > _UNTIMED * sigma)
+        arm_sigma = float(np.sqrt(of_arm.max(initial=0.0)))
+        return bool(max(found.offset_sigma_s * speed, arm_sigma) > _UNTIMED * sigma)
 
     def settle(self, found: WorldAlignment) -> list[NavState]:
         """Go on in the world of the fixes; all states so far in that world, the newest last."""
@@ -214,5 +326,15 @@ class Aiding:
         states = [with_unknown_gauge(state, found.covariance, found.centre) for state in states]
         self.aligned, self._fixes, self._path.states = True, [], list(states)
         self.offset_s, self._offset_sigma_s = self.offset_s + found.offset_s, found.offset_sigma_s
+        self.arm_m = self.arm_m + found.arm_m
         self._waiting = self._waiting.shifted(round(found.offset_s * 1e9))
+        self._shifted_s += found.offset_s
         return states
+
+    def variables_found(self, found: WorldAlignment) -> tuple[tuple[int, ...], gtsam.Values | None]:
+        """Keys and values of lever arm and clock, as far as they become variables."""
+        variables = self.variables
+        if variables is None or not variables.keys:
+            return (), None
+        values = np.append(self.offset_s + found.offset_s, self.arm_m + found.arm_m)
+        return variables.keys, variables.values(values)

@@ -9,6 +9,7 @@ from bisect import bisect_left
 import gtsam
 import numpy as np
 
+from slam_graph.arrays import FloatArray
 from slam_graph.backend.aiding.fix_factors import Fix, PositionFix, pose_between
 from slam_graph.backend.aiding.world_alignment import PathFix
 from slam_graph.geometry import NavState
@@ -47,6 +48,11 @@ class EstimatedPath:
         around = self.around(stamp_ns)
         return None if around is None else _between(around, stamp_ns)
 
+    def velocity(self, fix: PositionFix) -> FloatArray:
+        """Of the sensor (3,) of a fix at its time, m/s; zero where the path has none."""
+        around = self.around(fix.stamp_ns)
+        return np.zeros(3) if around is None else _velocity(fix, around)
+
     def at(self, fix: Fix, offset_ns: int) -> PathFix | None:
         """A fix with the path at its time; None where it has none.
 
@@ -60,8 +66,7 @@ class EstimatedPath:
             return None
         velocity = np.zeros(3)
         if isinstance(fix, PositionFix) and fix.is_timed:
-            velocity = fix.of(around[1].world_T_body) - fix.of(around[0].world_T_body)
-            velocity /= (around[1].stamp_ns - around[0].stamp_ns) * 1e-9
+            velocity = _velocity(fix, around)
         variances = variances_of(around[0])
         return PathFix(fix, _between(around, stamp_ns), *variances, velocity)
 
@@ -72,6 +77,11 @@ def variances_of(state: NavState) -> tuple[float, float]:
         return 0.0, 0.0
     variances = np.diag(state.covariance)
     return float(variances[3:6].sum()), float(variances[:3].sum())
+
+
+def _velocity(fix: PositionFix, around: tuple[NavState, NavState]) -> FloatArray:
+    moved = fix.of(around[1].world_T_body) - fix.of(around[0].world_T_body)
+    return moved / ((around[1].stamp_ns - around[0].stamp_ns) * 1e-9)
 
 
 def _between(around: tuple[NavState, NavState], stamp_ns: int) -> gtsam.Pose3:

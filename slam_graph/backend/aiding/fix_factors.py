@@ -21,13 +21,15 @@ from scipy.special import chdtri
 
 from slam_graph.arrays import FloatArray
 from slam_graph.backend.backend_config import BackendConfig
+from slam_graph.backend.cost.robust_loss import RobustLoss
 from slam_graph.sensors import AidingData
 
 _GATE = float(np.sqrt(chdtri(3, 0.001)))
 _HUBER = float(np.sqrt(chdtri(3, 0.05)))
 """Mahalanobis distances of an innovation beyond which a fix is rejected, and counts less."""
-_CAUCHY = 4.0
-"""Width of the Cauchy loss (σ): a good fix counts for 0.84, one that is off by 10 σ for 0.14."""
+FIX_LOSS = RobustLoss("cauchy", 4.0)
+"""The loss in the final adjustment: a good fix counts for 0.84, one that is off by 10 σ for
+0.14."""
 _REMEMBERED, _MOST_REJECTED = 10, 7
 """Where more of the last fixes were rejected, not they are wrong but the estimate is."""
 
@@ -118,14 +120,20 @@ def _noise(covariance: FloatArray, robust: bool) -> gtsam.noiseModel.Base:
     """Gaussian noise of a covariance (3, 3), under a Cauchy loss or not."""
     noise: gtsam.noiseModel.Base = gtsam.noiseModel.Gaussian.Covariance(covariance)
     if robust:
-        cauchy = gtsam.noiseModel.mEstimator.Cauchy.Create(_CAUCHY)
+        cauchy = gtsam.noiseModel.mEstimator.Cauchy.Create(FIX_LOSS.width)
         noise = gtsam.noiseModel.Robust.Create(cauchy, noise)
     return noise
 
 
-def fixes_of(data: AidingData, config: BackendConfig) -> list[Fix]:
-    """Absolute measurements of a stretch of time: positions by the fixes, then the known poses."""
-    arm = np.array(config.gnss.lever_arm_m)
+def fixes_of(data: AidingData, config: BackendConfig, arm_m: FloatArray | None = None) -> list[Fix]:
+    """Absolute measurements of a stretch of time: positions by the fixes, then the known poses.
+
+    Args:
+        data: with times on the clock of the estimate.
+        config: lever arms and the mounting of the sensor of known poses.
+        arm_m: (3,) lever arm of the position fixes, where it is not that of the settings.
+    """
+    arm = np.array(config.gnss.lever_arm_m) if arm_m is None else arm_m
     rows = zip(data.fix_stamps_ns.tolist(), data.fix_positions, data.fix_covariances, strict=True)
     fixes: list[Fix] = [PositionFix(*row, arm) for row in rows]
     arm = np.array(config.known_poses.lever_arm_m)

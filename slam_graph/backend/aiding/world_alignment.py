@@ -10,7 +10,8 @@ graduated non-convexity with the loss of Geman and McClure (Yang, Antonante, Tzo
 2020).
 
 The clock of the fixes may be off by a time that is known to some extent only. Then that time is one
-more unknown: a fix that is late by τ is where the path was τ before, along its velocity.
+more unknown: a fix that is late by τ is where the path was τ before, along its velocity. The same
+holds for the place of the antenna in the body, which moves the fixes as the body turns.
 """
 
 from __future__ import annotations
@@ -90,6 +91,9 @@ class WorldAlignment:
         fits: (N,) which fixes fit.
         offset_s: to be added to the times of fixes with a velocity.
         offset_sigma_s: its standard deviation; zero if it is known.
+        arm_m: (3,) to be added to the lever arm of these fixes.
+        joint: covariance of the gauge, then of the offset, then of the lever arm, as far as these
+            are unknown.
     """
 
     motion: gtsam.Pose3
@@ -98,6 +102,8 @@ class WorldAlignment:
     fits: BoolArray
     offset_s: float = 0.0
     offset_sigma_s: float = 0.0
+    arm_m: FloatArray = field(default_factory=lambda: np.zeros(3))
+    joint: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
 
 
 def enough_fixes(fixes: Sequence[Fix]) -> bool:
@@ -111,6 +117,7 @@ def align_world(
     centre: FloatArray,
     level: bool,
     offset: tuple[float, float] = (0.0, 0.0),
+    arm: tuple[FloatArray, float] | None = None,
 ) -> WorldAlignment | None:
     """The motion that brings a path to fixes of it; None as long as they do not tell it.
 
@@ -120,38 +127,78 @@ def align_world(
         level: whether gravity is measured, so that the motion is one in position and yaw.
         offset: mean and standard deviation of what is to be added to the times of fixes with a
             velocity, s; it is known if the latter is zero.
+        arm: mean (3,) and standard deviation of what is to be added to the lever arm of the same
+            fixes, m; None if it is known.
     """
     if not enough_fixes([pair.fix for pair in pairs]):
         return None
-    path = _Path.of(pairs, centre, level, offset)
+    path = _Path.of(pairs, centre, level, _Unknowns.of(offset, arm))
     motion = path.start()
     if motion is None:
         return None
-    late, distances = offset[0], path.distances(motion, offset[0])
+    extra = path.unknowns.expected
+    distances = path.distances(motion, extra)
     scale = max(2.0 * float(distances.max() / _WIDTH) ** 2, 1.0)
     while scale > 1.0:  # the loss is nearly quadratic at first
         weights = (scale * _WIDTH**2 / (distances**2 + scale * _WIDTH**2)) ** 2
-        motion, late, _ = path.step(motion, late, weights)
-        distances = path.distances(motion, late)
+        motion, extra, _ = path.step(motion, extra, weights)
+        distances = path.distances(motion, extra)
         scale /= _SHRINKING
     information = np.zeros((4, 4))
     for _ in range(_STEPS):
         fits = distances < _WIDTH
         if not path.supported(fits):
             return None
-        motion, late, information = path.step(motion, late, fits.astype(np.float64))
-        distances = path.distances(motion, late)
+        motion, extra, information = path.step(motion, extra, fits.astype(np.float64))
+        distances = path.distances(motion, extra)
     if np.linalg.cond(information) > 1e12:
         return None
     whole = np.asarray(np.linalg.inv(information), np.float64)
-    covariance = whole[:-1, :-1] if offset[1] > 0.0 else whole
-    sigma_s = float(np.sqrt(whole[-1, -1])) if offset[1] > 0.0 else 0.0
+    gauge, timed = len(whole) - len(extra), offset[1] > 0.0
+    covariance = whole[:gauge, :gauge]
+    late = float(extra[0]) if timed else offset[0]
+    sigma_s = float(np.sqrt(whole[gauge, gauge])) if timed else 0.0
     if np.sqrt(np.diag(covariance)[3:].max()) > _ROTATION_SIGMA_RAD:
         return None
     fitting = np.zeros(len(fits), np.bool_)
     fitting[path.order] = fits
     there = _moved(motion, centre[None])[0]
-    return WorldAlignment(motion, covariance, there, fitting, late, sigma_s)
+    added = np.zeros(3) if arm is None else extra[-3:]
+    return WorldAlignment(motion, covariance, there, fitting, late, sigma_s, added, whole)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Unknowns:
+    """What is not known of the sensor whose time may be estimated: its clock, its place, or both.
+
+    Attributes:
+        expected: (n,) time offset (s), then lever arm (m), beyond what pairs were made with.
+        sigmas: (n,) standard deviations.
+        timed: whether the time offset is one of them.
+        placed: whether the lever arm is.
+    """
+
+    expected: FloatArray
+    sigmas: FloatArray
+    timed: bool
+    placed: bool
+
+    @staticmethod
+    def of(offset: tuple[float, float], arm: tuple[FloatArray, float] | None) -> _Unknowns:
+        """See `align_world`."""
+        timed, placed = offset[1] > 0.0, arm is not None
+        mean = [offset[0]] * timed + (list(arm[0]) if arm is not None else [])
+        sigmas = [offset[1]] * timed + ([arm[1]] * 3 if arm is not None else [])
+        return _Unknowns(np.array(mean, float), np.array(sigmas, float), timed, placed)
+
+    def moving(self, pair: PathFix) -> FloatArray:
+        """How (3, n) the sensor of a position moves with them, in the estimator's own world."""
+        columns = np.zeros((3, len(self.expected)))
+        if self.timed:
+            columns[:, 0] = pair.velocity
+        if self.placed and pair.fix.is_timed:
+            columns[:, -3:] = pair.pose.rotation().matrix()
+        return columns
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -165,8 +212,8 @@ class _Path:
         order: (N,) numbers of the fixes as they were given.
         centre: (3,) the point about which the world turns, in the estimator's own world.
         level: whether the motion is one in position and yaw.
-        velocities: (P, 3) of the sensor.
-        offset: see `align_world`.
+        moving: (P, 3, n) how the sensor moves with the unknowns.
+        unknowns: n of them.
     """
 
     places: FloatArray
@@ -177,13 +224,11 @@ class _Path:
     order: list[int]
     centre: FloatArray
     level: bool
-    velocities: FloatArray
-    offset: tuple[float, float]
+    moving: FloatArray
+    unknowns: _Unknowns
 
     @staticmethod
-    def of(
-        pairs: Sequence[PathFix], centre: FloatArray, level: bool, offset: tuple[float, float]
-    ) -> _Path:
+    def of(pairs: Sequence[PathFix], centre: FloatArray, level: bool, unknowns: _Unknowns) -> _Path:
         """See `align_world`."""
         positions: list[tuple[FloatArray, FloatArray]] = []
         rotations: list[tuple[FloatArray, FloatArray]] = []
@@ -204,9 +249,11 @@ class _Path:
         covariances: FloatArray = np.array(noise[0] + noise[1])
         roots: FloatArray = np.linalg.inv(np.linalg.cholesky(covariances))
         given = order[0] + order[1]
-        velocities = np.array([pairs[n].velocity for n in order[0]]).reshape(-1, 3)
+        moving = np.zeros((len(order[0]), 3, len(unknowns.expected)))
+        for row, n in enumerate(order[0]):
+            moving[row] = unknowns.moving(pairs[n])
         return _Path(
-            places, fixes, turns, orientations, roots, given, centre, level, velocities, offset
+            places, fixes, turns, orientations, roots, given, centre, level, moving, unknowns
         )
 
     def start(self) -> gtsam.Pose3 | None:
@@ -241,58 +288,56 @@ class _Path:
             least = min(2, len(among))
         return bool(np.count_nonzero(among) >= max(least, _LEAST_SHARE * len(among)))
 
-    def residuals(self, motion: gtsam.Pose3, late: float) -> FloatArray:
+    def residuals(self, motion: gtsam.Pose3, extra: FloatArray) -> FloatArray:
         """(N, 3) what was measured beyond the moved path, m or rad, not whitened.
 
         Args:
             motion: of the world.
-            late: time that is added to the fixes, s.
+            extra: (n,) the unknowns of the sensor.
         """
         turned = motion.rotation().matrix() @ self.turns
         off = Rotation.from_matrix(self.orientations @ turned.transpose(0, 2, 1)).as_rotvec()
-        moved = _moved(motion, self.places + late * self.velocities)
+        moved = _moved(motion, self.places + self.moving @ extra)
         return np.concatenate([self.fixes - moved, off.reshape(-1, 3)])
 
-    def distances(self, motion: gtsam.Pose3, late: float) -> FloatArray:
+    def distances(self, motion: gtsam.Pose3, extra: FloatArray) -> FloatArray:
         """Residuals (N,) in σ."""
-        white = np.einsum("nij,nj->ni", self.roots, self.residuals(motion, late))
+        white = np.einsum("nij,nj->ni", self.roots, self.residuals(motion, extra))
         return np.asarray(np.linalg.norm(white, axis=1))
 
     def step(
-        self, motion: gtsam.Pose3, late: float, weights: FloatArray
-    ) -> tuple[gtsam.Pose3, float, FloatArray]:
-        """One Gauss-Newton step, and the information on the gauge, and on the time if it is open.
+        self, motion: gtsam.Pose3, extra: FloatArray, weights: FloatArray
+    ) -> tuple[gtsam.Pose3, FloatArray, FloatArray]:
+        """One Gauss-Newton step, and the information on the gauge and the unknowns of the sensor.
 
         Args:
             motion: of the world.
-            late: time that is added to the fixes, s.
+            extra: (n,) these unknowns.
             weights: (N,) of the fixes.
         """
-        moved, axes = _moved(motion, self.places + late * self.velocities), turned_axes(self.level)
+        moved, axes = _moved(motion, self.places + self.moving @ extra), turned_axes(self.level)
         middle, count, turned = _moved(motion, self.centre[None])[0], len(moved), 3 + len(axes)
-        timed = self.offset[1] > 0.0
-        J = np.zeros((len(weights), 3, turned + timed))
+        unknowns = self.unknowns
+        J = np.zeros((len(weights), 3, turned + len(extra)))
         J[:count, :, :3] = np.eye(3)
         J[:count, :, 3:turned] = np.cross(axes, (moved - middle)[:, None]).transpose(0, 2, 1)
         J[count:, :, 3:turned] = axes.T
-        if timed:
-            J[:count, :, turned] = self.velocities @ motion.rotation().matrix().T
+        J[:count, :, turned:] = motion.rotation().matrix() @ self.moving
         roots = np.sqrt(weights)[:, None, None] * self.roots
         white = (roots @ J).reshape(-1, J.shape[2])
-        right = np.einsum("nij,nj->ni", roots, self.residuals(motion, late)).reshape(-1)
-        known, of_known = np.zeros((4, J.shape[2])), np.zeros(4)
+        right = np.einsum("nij,nj->ni", roots, self.residuals(motion, extra)).reshape(-1)
+        known, of_known = np.zeros((4 + len(extra), J.shape[2])), np.zeros(4 + len(extra))
         if not count:
             known[:3, :3] = np.eye(3) / _KEPT_SIGMA_M
-        if timed:
-            known[3, -1] = 1.0 / self.offset[1]
-            of_known[3] = (self.offset[0] - late) / self.offset[1]
+        known[4:, turned:] = np.diag(1.0 / unknowns.sigmas)
+        of_known[4:] = (unknowns.expected - extra) / unknowns.sigmas
         white, right = np.vstack([white, known]), np.concatenate([right, of_known])
         delta = np.linalg.lstsq(white, right, rcond=None)[0]
         turn = gtsam.Rot3.Expmap(axes.T @ delta[3:turned])
         # x -> turn (x - middle) + middle + shift
         shift = middle + delta[:3] - turn.rotate(middle)
-        late += float(delta[-1]) if timed else 0.0
-        return gtsam.Pose3(turn, shift).compose(motion), late, white.T @ white
+        extra = extra + delta[turned:]
+        return gtsam.Pose3(turn, shift).compose(motion), extra, white.T @ white
 
 
 def _moved(motion: gtsam.Pose3, places: FloatArray) -> FloatArray:

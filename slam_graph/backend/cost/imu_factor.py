@@ -197,7 +197,7 @@ class Propagation:
         """Append what fixes and odometry say of the motion to the new frame."""
         known = self._predicted or self._last
         covariance = None if known is None or known.covariance is None else known.covariance[:6, :6]
-        window.factors += aiding.factors(window.state, frames, stamps_ns, covariance)
+        window.factors += aiding.factors(window.state, frames, stamps_ns, covariance, window.prior)
 
     def _predict_covariance(
         self, predicted: NavState, factor: gtsam.CombinedImuFactor, window: Window

@@ -57,6 +57,11 @@ class SmootherEngine:
                 f"backend.calibration is not for '{context.algorithm.name}': GTSAM's smoothers "
                 "take the calibration as it is; use msckf, swf, okvis, ekf or iekf"
             )
+        if context.config.gnss.lever_arm_sigma_m > 0.0:
+            raise ConfigError(
+                f"backend.gnss.lever_arm_sigma_m is not for '{context.algorithm.name}': GTSAM's "
+                "smoothers take the lever arm as it is; use msckf, swf, okvis, ekf or iekf"
+            )
         self._context = context
         self._policy = context.algorithm.smoother
         self._features = SmootherFeatures(

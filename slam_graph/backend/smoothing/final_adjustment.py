@@ -39,7 +39,7 @@ from slam_graph.backend.solve.single_thread import on_one_thread
 from slam_graph.backend.world_gauge import in_gauge_of, in_moved_world, world_motion
 from slam_graph.errors import EstimationError
 from slam_graph.geometry import NavState, StateHistory, Trajectory
-from slam_graph.sensors import Rig
+from slam_graph.sensors import FixCalibration, Rig
 
 logger = logging.getLogger(__name__)
 
@@ -73,6 +73,8 @@ class FinalBa:
             segment.
         equations: those at the minimum, which others can be joined to; None if they were not wanted
             or are not known, and where the recording was adjusted in several segments.
+        fixes: lever arm and clock of the position fixes, where they are variables; of the last
+            segment.
     """
 
     history: StateHistory
@@ -80,6 +82,7 @@ class FinalBa:
     aligned: FloatArray | None
     noise: ImuNoiseFactors = field(default_factory=ImuNoiseFactors)
     equations: PoseEquations | None = None
+    fixes: FixCalibration | None = None
 
     @property
     def trajectory(self) -> Trajectory:
@@ -206,8 +209,9 @@ def _smoothed(log: FrameLog, causal: Trajectory, task: SmoothingTask, report: Re
         stamps_ns = segment.keyframe_stamps_ns
         if not _overlaps(causal, stamps_ns):
             continue
-        aiding = aiding_of_keyframes(stamps_ns, log.aiding, causal, task.backend)
-        segment, absolute = replace(segment, aiding=aiding), len(aiding.fixes) > 0
+        given = log.aiding, causal, task.backend, log.fix_calibration
+        aiding = aiding_of_keyframes(stamps_ns, *given)
+        segment, absolute = replace(segment, aiding=aiding), aiding.absolute
         start = states_at(causal, stamps_ns, segment.imu, task.preintegration)
         if not level:
             task = replace(task, causal=causal)
@@ -249,6 +253,7 @@ def _smoothed(log: FrameLog, causal: Trajectory, task: SmoothingTask, report: Re
         None if alone is None else alone.aligned,
         solved[-1].noise,
         None if alone is None else alone.equations,
+        solved[-1].fixes,
     )
 
 

@@ -29,6 +29,7 @@ from slam_graph.sensors import (
     AidingData,
     FeatureFrame,
     FeatureObservations,
+    FixCalibration,
     ImuData,
     Packet,
     Rig,
@@ -60,6 +61,7 @@ class FrameLog:
         observations: number of all of them.
         georeferenced: whether the causal estimate is in the world of the position fixes.
         fix_offset_s: time that was found to be missing from those of the fixes.
+        fix_calibration: lever arm and clock of the fixes, where they are variables.
     """
 
     def __init__(
@@ -82,6 +84,7 @@ class FrameLog:
         self._aiding: list[AidingData] = []
         self.observations = 0
         self.georeferenced, self.fix_offset_s = False, 0.0
+        self.fix_calibration: FixCalibration | None = None
 
     @classmethod
     @contextmanager

@@ -11,14 +11,18 @@ import gtsam
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from slam_graph.arrays import IntArray
+from slam_graph.arrays import FloatArray, IntArray
+from slam_graph.backend.aiding.fix_calibration import FixVariables, SeenFixes
 from slam_graph.backend.aiding.fix_factors import Fix, PositionFix, fixes_of, pose_key
 from slam_graph.backend.aiding.odometry_factors import odometry_factor
 from slam_graph.backend.aiding.world_alignment import enough_fixes
 from slam_graph.backend.backend_config import BackendConfig
+from slam_graph.backend.smoothing.calibrated_fixes import CalibratedFixes
 from slam_graph.geometry import Trajectory, interpolate
-from slam_graph.sensors import AidingData
+from slam_graph.sensors import AidingData, FixCalibration
 
+_NEAR_NS = 50_000_000
+"""The velocity at a fix is the mean of so long before and after it."""
 _LONGEST_GAP_S = 1.0
 """Poses farther apart are not interpolated."""
 
@@ -31,11 +35,22 @@ class KeyframeAiding:
         fixes: absolute ones; they determine the world of the segment.
         odometry: between consecutive keyframes.
         source: what they were made of; None for nothing.
+        calibrated: fixes whose lever arm or clock is a variable; None where they are held.
     """
 
     fixes: tuple[gtsam.NonlinearFactor, ...] = ()
     odometry: tuple[gtsam.NonlinearFactor, ...] = ()
-    source: tuple[AidingData, Trajectory, BackendConfig] | None = None
+    source: tuple[AidingData, Trajectory, BackendConfig, FixCalibration | None] | None = None
+    calibrated: CalibratedFixes | None = None
+
+    @property
+    def absolute(self) -> bool:
+        """Whether there are fixes, which determine the world."""
+        return len(self.fixes) > 0 or self.calibrated is not None
+
+    def shared(self) -> FloatArray:
+        """Lever arm and clock to begin with (n,), as far as they are variables."""
+        return np.zeros(0) if self.calibrated is None else self.calibrated.first()
 
     def at(self, stamps_ns: IntArray) -> KeyframeAiding:
         """The same on some of the keyframes, by their times (K,)."""
@@ -43,7 +58,11 @@ class KeyframeAiding:
 
 
 def aiding_of_keyframes(
-    stamps_ns: IntArray, data: AidingData, causal: Trajectory, config: BackendConfig
+    stamps_ns: IntArray,
+    data: AidingData,
+    causal: Trajectory,
+    config: BackendConfig,
+    found: FixCalibration | None = None,
 ) -> KeyframeAiding:
     """The factors of fixes, known poses and odometry.
 
@@ -55,32 +74,61 @@ def aiding_of_keyframes(
         data: of the recording; fixes only if the causal estimate is in their world.
         causal: the causal estimate.
         config: lever arms, time offsets, noise.
+        found: lever arm and clock of the fixes, if they are variables; `data` has the times that
+            they were found to have.
     """
     if not len(data):
         return KeyframeAiding()
-    source = data, causal, config
+    source = data, causal, config, found
     odometry: list[gtsam.NonlinearFactor] = []
     for k, ends in enumerate(pairwise(stamps_ns.tolist())):
         moved = data.odometry_between(*ends) if config.odometry.enabled else None
         if moved is not None:
             odometry.append(odometry_factor((k, k + 1), moved, config.odometry))
     near = config.on_the_clock(data).within(int(stamps_ns[0]), int(stamps_ns[-1]))
-    measured = fixes_of(near, config)
+    measured = fixes_of(near, config, None if found is None else found.lever_arm_m)
     fixes_ns = np.array([fix.stamp_ns for fix in measured], dtype=np.int64)
     middles = stamps_ns[:-1] + np.diff(stamps_ns) // 2
     keyframes = np.searchsorted(middles, fixes_ns).tolist()
     then, at = _poses_at(causal, fixes_ns), _poses_at(causal, stamps_ns)
     used: list[Fix] = []
     fixes: list[gtsam.NonlinearFactor] = []
+    free: list[tuple[PositionFix, tuple[gtsam.Pose3, gtsam.Pose3], int]] = []
     for fix, pose, k in zip(measured, then, keyframes, strict=True):
         here = at[k]
         if pose is not None and here is not None:
             used.append(fix)
+            if found is not None and isinstance(fix, PositionFix) and fix.is_timed:
+                free.append((fix, (pose, here), k))
+                continue
             fixes.append(fix.moved(pose, here).factor(pose_key(k), robust=True))
     located = any(isinstance(fix, PositionFix) for fix in used)
     if not located or not enough_fixes(used):
-        fixes = []
-    return KeyframeAiding(tuple(fixes), tuple(odometry), source)
+        fixes, free = [], []
+    calibrated = None
+    if found is not None and free:
+        calibrated = _calibrated(free, causal, FixVariables(config.gnss), found)
+    return KeyframeAiding(tuple(fixes), tuple(odometry), source, calibrated)
+
+
+def _calibrated(
+    free: list[tuple[PositionFix, tuple[gtsam.Pose3, gtsam.Pose3], int]],
+    causal: Trajectory,
+    variables: FixVariables,
+    found: FixCalibration,
+) -> CalibratedFixes:
+    """Fixes with the poses of the body then and at their keyframes, and the numbers of these."""
+    fixes = [fix for fix, _, _ in free]
+    stamps_ns = np.array([fix.stamp_ns for fix in fixes], np.int64)
+    before, after = (_poses_at(causal, stamps_ns + sign * _NEAR_NS) for sign in (-1, 1))
+    velocities = np.zeros((len(fixes), 3))
+    for row, (fix, first, last) in enumerate(zip(fixes, before, after, strict=True)):
+        if first is not None and last is not None:
+            velocities[row] = (fix.of(last) - fix.of(first)) / (2e-9 * _NEAR_NS)
+    seen = SeenFixes.of(fixes, [poses for _, poses, _ in free], velocities, found.time_offset_s)
+    roots = np.linalg.inv(np.linalg.cholesky(np.array([fix.covariance for fix in fixes])))
+    keyframes = np.array([k for _, _, k in free], np.int64)
+    return CalibratedFixes(seen, roots, keyframes, variables, found.values)
 
 
 def _poses_at(trajectory: Trajectory, stamps_ns: IntArray) -> list[gtsam.Pose3 | None]:

@@ -21,6 +21,7 @@ from slam_graph.backend.smoothing.recording_cost import (
 from slam_graph.backend.smoothing.recording_factors import RecordingFactors
 from slam_graph.backend.smoothing.state_elimination import ChainEquations, EliminatedStates
 from slam_graph.errors import EstimationError
+from slam_graph.sensors import FixCalibration
 
 logger = logging.getLogger(__name__)
 
@@ -64,12 +65,14 @@ class EliminatedMinimum:
         values: X(k), V(k) and B(k) at the minimum. The parts are linearised within the last step of
             it, and agree to first order.
         states: the factor.
+        fixes: lever arm and clock of position fixes; None where they are no variables.
     """
 
     images: ImageEquations | None
     inertial: gtsam.NonlinearFactorGraph
     values: gtsam.Values
     states: EliminatedStates
+    fixes: FixCalibration | None = None
 
     def chain(self) -> ChainEquations:
         """The equations of the other factors."""
@@ -105,7 +108,7 @@ def equations_at_minimum(
         LinAlgError: if the cost does not determine all variables.
     """
     cost, estimates = found.cost, found.estimates
-    features = EliminatedFeatures(cost.images.linearized(estimates), cost.keyframes)
+    features = cost.linearized(estimates).eliminated()
     inertial, states = cost.inertial, None
     known = near or _eliminated(features, cost, factors, estimates)
     for _ in range(_ROUNDS if learn else 0):
@@ -130,9 +133,16 @@ def equations_at_minimum(
     inertial = _with_gauge(inertial, factors, estimates)
     images = None
     if keep:
-        gradient = cost.images.linearized(estimates).gradient(cost.keyframes)
-        images = ImageEquations(features.poses, features.reduced(*gradient)[0])
-    return EliminatedMinimum(images, inertial, estimates.states, states)
+        linear = cost.linearized(estimates)
+        gradient = features.reduced(*linear.images.gradient(cost.keyframes))[0]
+        if linear.fixes is not None and features.fixes is not None:
+            gradient += features.fixes.reduced(*linear.fixes.gradient(cost.keyframes))
+        images = ImageEquations(features.poses, gradient)
+    fixes = None
+    if cost.fixes is not None and features.fixes is not None:
+        covariance = features.fixes.covariance(states)
+        fixes = cost.fixes.calibration(estimates.fixes, covariance)
+    return EliminatedMinimum(images, inertial, estimates.states, states, fixes)
 
 
 def _eliminated(

@@ -9,7 +9,7 @@ one pass, and whose features a compiled kernel eliminates (`kernels/feature_elim
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import gtsam
 import numpy as np
@@ -19,6 +19,11 @@ from slam_graph.arrays import FloatArray
 from slam_graph.backend.cost.feature_tracks import Observations
 from slam_graph.backend.cost.reprojection import Geometry, RigProjection
 from slam_graph.backend.cost.robust_loss import RobustLoss
+from slam_graph.backend.smoothing.calibrated_fixes import (
+    CalibratedFixes,
+    EliminatedFixes,
+    LinearFixes,
+)
 from slam_graph.backend.smoothing.state_elimination import (
     ChainEquations,
     EliminatedStates,
@@ -35,10 +40,12 @@ class Estimates:
     Attributes:
         states: X(k), V(k) and B(k) of the keyframes.
         points: (J, 3) features in the world.
+        fixes: (n,) lever arm and clock of position fixes, as far as they are variables.
     """
 
     states: gtsam.Values
     points: FloatArray
+    fixes: FloatArray = field(default_factory=lambda: np.zeros(0))
 
     def moved(self, step: Step) -> Estimates:
         """The estimates after a step."""
@@ -47,15 +54,17 @@ class Estimates:
             delta.insert(X(k), state[:6])
             delta.insert(V(k), state[6:9])
             delta.insert(B(k), state[9:])
-        return Estimates(self.states.retract(delta), self.points + step.points)
+        states = self.states.retract(delta)
+        return Estimates(states, self.points + step.points, self.fixes + step.fixes)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Step:
-    """Increments of keyframe states (K, 15) and features (J, 3)."""
+    """Increments of keyframe states (K, 15), features (J, 3) and what is shared by fixes (n,)."""
 
     states: FloatArray
     points: FloatArray
+    fixes: FloatArray = field(default_factory=lambda: np.zeros(0))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -138,13 +147,21 @@ class EliminatedFeatures:
         linear: the linearised reprojection errors.
         keyframes: number of keyframes K.
         damping: is added to the diagonal.
+        fixes: linearised position fixes with variables of their own; None for none.
 
     Attributes:
+        fixes: the factor of these variables, whose remains are in `poses` too.
         poses: (n, n) lower triangle of the information on the poses, in `StateColumns`; until
             `EliminatedStates` overwrites it.
     """
 
-    def __init__(self, linear: LinearReprojection, keyframes: int, damping: float = 0.0) -> None:
+    def __init__(
+        self,
+        linear: LinearReprojection,
+        keyframes: int,
+        damping: float = 0.0,
+        fixes: LinearFixes | None = None,
+    ) -> None:
         obs = linear.obs
         new = np.ones(len(obs), np.bool_)
         new[1:] = (np.diff(obs.feature) != 0) | (np.diff(obs.frame) != 0)
@@ -164,6 +181,10 @@ class EliminatedFeatures:
             self._inverse_roots,
             self._T,
         )
+        self.fixes: EliminatedFixes | None = None
+        if fixes is not None:
+            self.fixes = EliminatedFixes(fixes, keyframes, damping)
+            self.fixes.add_to(self.poses)
 
     def reduced(self, by_pose: FloatArray, by_point: FloatArray) -> tuple[FloatArray, FloatArray]:
         """The gradient (K, 6) by the poses without features, and L⁻¹ times that (J, 3) by these."""
@@ -203,8 +224,15 @@ class Factor:
         by_pose, by_point = linear.images.gradient(len(by_state))
         reduced, t = self.features.reduced(by_pose, by_point)
         by_state[:, :6] += reduced
+        eliminated = self.features.fixes
+        if linear.fixes is None or eliminated is None:
+            states = self.states.times_covariance(by_state[:, :, None])[:, :, 0]
+            return Step(states, self.features.points(t, states[:, :6]))
+        by_pose, by_fixes = linear.fixes.gradient(len(by_state))
+        by_state[:, :6] += eliminated.reduced(by_pose, by_fixes)
         states = self.states.times_covariance(by_state[:, :, None])[:, :, 0]
-        return Step(states, self.features.points(t, states[:, :6]))
+        shared = eliminated.step(by_fixes, states[:, :6])
+        return Step(states, self.features.points(t, states[:, :6]), shared)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -214,10 +242,16 @@ class LinearCost:
     Attributes:
         chain: priors, IMU and zero-velocity factors.
         images: the reprojection errors.
+        fixes: position fixes with variables of their own; None for none.
     """
 
     chain: ChainEquations
     images: LinearReprojection
+    fixes: LinearFixes | None = None
+
+    def eliminated(self, damping: float = 0.0) -> EliminatedFeatures:
+        """The factor of all but the states."""
+        return EliminatedFeatures(self.images, len(self.chain.gradient), damping, self.fixes)
 
     def factor(self, damping: float) -> Factor:
         """The factor of the normal equations, damped.
@@ -225,7 +259,7 @@ class LinearCost:
         Raises:
             LinAlgError: if they are not positive definite.
         """
-        features = EliminatedFeatures(self.images, len(self.chain.gradient), damping)
+        features = self.eliminated(damping)
         return Factor(features, EliminatedStates(features.poses, self.chain, damping))
 
 
@@ -237,20 +271,28 @@ class RecordingCost:
         inertial: priors, IMU and zero-velocity factors.
         images: the reprojection errors.
         keyframes: number of keyframes.
+        fixes: position fixes with variables of their own; None for none.
     """
 
     inertial: gtsam.NonlinearFactorGraph
     images: ReprojectionCost
     keyframes: int
+    fixes: CalibratedFixes | None = None
 
     def value(self, estimates: Estimates) -> float:
         """The cost."""
-        return float(self.inertial.error(estimates.states)) + self.images.value(estimates)
+        value = float(self.inertial.error(estimates.states)) + self.images.value(estimates)
+        if self.fixes is None:
+            return value
+        return value + self.fixes.value(estimates.states, estimates.fixes)
 
     def linearized(self, estimates: Estimates) -> LinearCost:
-        """Both parts linearised."""
+        """All parts linearised."""
         chain = ChainEquations.of(self.inertial.linearize(estimates.states), self.keyframes)
-        return LinearCost(chain, self.images.linearized(estimates))
+        fixes = None
+        if self.fixes is not None:
+            fixes = self.fixes.linearized(estimates.states, estimates.fixes)
+        return LinearCost(chain, self.images.linearized(estimates), fixes)
 
     def with_inertial(self, inertial: gtsam.NonlinearFactorGraph) -> RecordingCost:
         """The cost with other priors, IMU and zero-velocity factors."""

@@ -177,7 +177,7 @@ class RecordingFactors:
             sigma: of position (m) and yaw (rad); by default so small that they define the world.
                 Where position fixes do, nothing is known of them.
         """
-        if self._segment.aiding.fixes:
+        if self._segment.aiding.absolute:
             sigma = _UNKNOWN_GAUGE
         pose = values.atPose3(X(self._anchor))
         tilt = _UNKNOWN_TILT_RAD if self._rig.has_imu else sigma

@@ -61,7 +61,7 @@ from slam_graph.backend.smoothing.state_elimination import EliminatedStates
 from slam_graph.backend.smoothing.track_correlation import statistical_inefficiency
 from slam_graph.backend.solve.stacked_values import stacked_poses
 from slam_graph.geometry import NavState, Trajectory
-from slam_graph.sensors import Rig
+from slam_graph.sensors import FixCalibration, Rig
 
 logger = logging.getLogger(__name__)
 
@@ -145,6 +145,7 @@ class AdjustedSegment:
         aligned: (N, 6, 6) pose covariances after an alignment in position and yaw, or None.
         noise: factors on the noise of the IMU that the covariances were computed with.
         equations: those at the minimum, if they are wanted and there are covariances.
+        fixes: lever arm and clock of position fixes, where they are variables.
     """
 
     states: list[NavState]
@@ -152,6 +153,7 @@ class AdjustedSegment:
     aligned: FloatArray | None
     noise: ImuNoiseFactors
     equations: PoseEquations | None
+    fixes: FixCalibration | None = None
 
 
 class BundleAdjustment:
@@ -181,7 +183,7 @@ class BundleAdjustment:
         self._everything = segment.seen.subset(chosen)
         self.iterations = self._passes = 0
         self._sigma_px, self._inefficiency = backend.noise.pixel_sigma, 1.0
-        self._values = values_of(start.states)
+        self._values, self._shared = values_of(start.states), segment.aiding.shared()
         self._given = values_of(start.given or start.states)
         self._factor: EliminatedStates | None = None
         self._note_motions()
@@ -209,7 +211,8 @@ class BundleAdjustment:
         if self._config.learn_pixel_sigma and self._learn_inefficiency():
             points = self._minimum.estimates.points
             cost, imu_cost = self._minimize(obs, points, variances, self._config.tolerance)
-        inefficiency = self._inefficiency
+        images = self._minimum.cost.images
+        squares = images.value(self._minimum.estimates) * images.inefficiency
         figures = AdjustmentFigures(
             keyframes=len(keyframes),
             features=len(obs.ids),
@@ -218,9 +221,9 @@ class BundleAdjustment:
             cost_before=self._cost_before(obs),
             cost_after=cost,
             imu_residual=float(np.sqrt(2.0 * imu_cost / (15 * max(len(keyframes) - 1, 1)))),
-            pixel_residual=float(np.sqrt((cost - imu_cost) * inefficiency / max(len(obs), 1))),
+            pixel_residual=float(np.sqrt(squares / max(len(obs), 1))),
             pixel_sigma=self._sigma_px,
-            inefficiency=inefficiency,
+            inefficiency=images.inefficiency,
         )
         states, aligned, equations = self._states(self._segment.stamps_ns), None, None
         try:
@@ -232,7 +235,8 @@ class BundleAdjustment:
             logger.info("no covariances: %s", " ".join(str(error).split())[:200])
             equations = None
         kept = equations if self._task.joint else None
-        return AdjustedSegment(states, figures, aligned, self.imu_noise, kept)
+        fixes = None if equations is None else equations.minimum.fixes
+        return AdjustedSegment(states, figures, aligned, self.imu_noise, kept, fixes)
 
     def solve_loosely(self, stamps_ns: IntArray) -> list[NavState]:
         """States near the minimum, with outliers, to a loose tolerance.
@@ -345,13 +349,14 @@ class BundleAdjustment:
                 self._inefficiency,
             ),
             len(self._segment.keyframes),
+            self._segment.aiding.calibrated,
         )
-        start = Estimates(self._values, points)
+        start = Estimates(self._values, points, self._shared)
         steps = self._config.max_iterations
         self._factor = None  # it is large
         end, value, self._factor = minimized(cost, start, tolerance, steps, self._count_step)
         self._passes += 1
-        self._values = end.states
+        self._values, self._shared = end.states, end.fixes
         self._minimum = Minimum(cost, end)
         return value, inertial.error(self._values)
 
@@ -375,7 +380,7 @@ class BundleAdjustment:
         poses = stacked_poses(self._given, obs.frames)
         points, good = triangulated(obs, poses, self._projection, self._backend)
         points[~good] = self._minimum.estimates.points[~good]
-        return self._minimum.cost.value(Estimates(self._given, points))
+        return self._minimum.cost.value(Estimates(self._given, points, self._shared))
 
     def _equations(self) -> PoseEquations:
         """The equations at the minimum.

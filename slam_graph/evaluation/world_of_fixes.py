@@ -1,0 +1,44 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""Whether a ground truth is in the world of position fixes, so that nothing need be aligned."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from slam_graph.errors import DataError
+from slam_graph.geometry import Similarity, Trajectory, interpolate
+from slam_graph.sensors import AidingData
+
+_LEAST_FIXES = 8
+_LARGER = 3.0
+"""Fixes are at most this many times as far from the truth as from the truth aligned with them, or
+as their noise. What is left then is lever arm, clock and multipath."""
+
+
+def is_in_world_of_fixes(truth: Trajectory | None, aiding: AidingData) -> bool:
+    """Whether a truth is in the world of fixes or known poses of the same recording.
+
+    Args:
+        truth: the true trajectory; None says no.
+        aiding: on the clock of the truth.
+    """
+    stamps_ns, positions = aiding.fix_stamps_ns, aiding.fix_positions
+    sigmas = np.sqrt(np.trace(aiding.fix_covariances, axis1=1, axis2=2))
+    if not len(stamps_ns):
+        stamps_ns, positions = aiding.pose_stamps_ns, aiding.pose_positions
+        sigmas = np.linalg.norm(aiding.pose_sigmas[:, :3], axis=1)
+    known = np.isfinite(sigmas)
+    if truth is None or len(truth) == 0 or not known.any():
+        return False
+    near, valid = interpolate(truth, stamps_ns[known])
+    fixes, sigma = positions[known][valid], float(np.median(sigmas[known]))
+    if len(fixes) < _LEAST_FIXES:
+        return False
+    apart = float(np.median(np.linalg.norm(fixes - near.positions, axis=1)))
+    try:
+        aligned = Similarity.of_positions(fixes, near.positions, "yaw").apply(near)
+    except DataError:  # a path that determines no yaw
+        return apart <= _LARGER * sigma
+    rest = float(np.median(np.linalg.norm(fixes - aligned.positions, axis=1)))
+    return apart <= _LARGER * max(rest, sigma)
