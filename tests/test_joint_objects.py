@@ -20,6 +20,7 @@ from slam_graph.backend.smoothing import joint_objects, object_smoothing
 from slam_graph.backend.smoothing.final_adjustment import FinalBa
 from slam_graph.backend.smoothing.joint_objects import JointObject, joined
 from slam_graph.backend.smoothing.pose_equations import PoseEquations
+from slam_graph.backend.solve.single_thread import on_one_thread
 from slam_graph.geometry import Trajectory, interpolate
 from slam_graph.pipeline import run
 from slam_graph.results import RunResult
@@ -62,7 +63,7 @@ def flight() -> Flight:
         changes = {"objects.enabled": True, "backend.noise.pixel_sigma": 0.5}
         result = run(sequence, overrides=changes)
     ((platform, apart),) = kept
-    best, together = joined(platform, apart)
+    best, together = on_one_thread(joined)(platform, apart)  # as the run does
     return Flight(result, platform, apart, best, together)
 
 
