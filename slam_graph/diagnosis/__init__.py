@@ -13,9 +13,18 @@ from typing import TYPE_CHECKING
 
 from slam_graph.lazy import lazy_exports
 
-__all__ = ["Diagnosis"]
+__all__ = ["ClockWindow", "Diagnosis", "Finding", "clock_change"]
 
 if TYPE_CHECKING:
+    from slam_graph.diagnosis.clock_windows import ClockWindow, clock_change
     from slam_graph.diagnosis.diagnose import Diagnosis
+    from slam_graph.diagnosis.finding import Finding
 else:
-    __getattr__, __dir__ = lazy_exports(__name__, {"diagnose": ("Diagnosis",)})
+    __getattr__, __dir__ = lazy_exports(
+        __name__,
+        {
+            "clock_windows": ("ClockWindow", "clock_change"),
+            "diagnose": ("Diagnosis",),
+            "finding": ("Finding",),
+        },
+    )

@@ -32,6 +32,7 @@ SETUP_KINDS = (
     "gyroscope_axes",
     "mounting",
     "time_offset",
+    "time_offset_change",
     "focal_length",
     "stereo_geometry",
     "baseline",
