@@ -7,7 +7,7 @@ import pytest
 
 import slam_graph as sg
 from slam_graph.datasets.faults.injection import inject
-from slam_graph.diagnosis import ClockWindow, clock_change
+from slam_graph.diagnosis import ClockWindow, Diagnosis, clock_change
 from slam_graph.sensors import FeatureFrame, ImuData
 
 WINDOW_S = 8.0
@@ -51,6 +51,14 @@ def test_an_offset_that_stays_is_no_change() -> None:
 def test_what_was_lost_does_not_count() -> None:
     found = windows(f"imu_late:at_s={CHANGES_S},by_s=0.03")
     assert clock_change(found, [(found[0].begin_ns, found[1].end_ns)], found[0].begin_ns) is None
+
+
+def test_doctor_names_a_change() -> None:
+    """And no single offset of the whole recording."""
+    flight = sg.simulate(trajectory="random", duration_s=20.0, rate_hz=10.0, seed=3)
+    for fault, named in (([], []), (["imu_late:at_s=9,by_s=0.03"], ["time_offset_change"])):
+        diagnosis = Diagnosis.of(inject(flight, fault))
+        assert [finding.kind for finding in diagnosis.setup_faults] == named
 
 
 def test_a_run_whose_clocks_change_is_suspect() -> None:

@@ -18,11 +18,14 @@ from slam_graph.arrays import FloatArray
 from slam_graph.diagnosis.camera_and_gyroscope import BAD_OFFSET_S, CLEARLY, FEWEST_PAIRS, SIGMAS
 from slam_graph.diagnosis.finding import Finding
 from slam_graph.diagnosis.frame_pairs import frame_pairs
-from slam_graph.diagnosis.gathering import Part, around, uninterrupted
+from slam_graph.diagnosis.gathering import PART_S, Part, around, uninterrupted
 from slam_graph.diagnosis.gyroscope import Gyroscope
 from slam_graph.diagnosis.rotation_fit import Kinematics, RotationFit, RotationProblem
 from slam_graph.sensors import FeatureFrame, ImuData, Rig
 
+_LEAST_RATE = 0.05
+"""Standard deviation of the angular rate, rad/s, below which a window does not show an offset to
+some milliseconds."""
 _LEAST_SIGMA_S = 1e-3
 """No offset of a window is known better than this."""
 _PRECISION = 0.1
@@ -74,7 +77,10 @@ class ClockWindow:
         begin_ns, end_ns = frames[0].stamp_ns, frames[-1].stamp_ns
         finite = np.isfinite(imu.gyro).all(axis=1)
         imu = ImuData(imu.stamps_ns[finite], imu.gyro[finite], imu.accel[finite])
-        pieces = uninterrupted(Part(list(frames), around(imu, begin_ns, end_ns)))
+        imu = around(imu, begin_ns, end_ns)
+        if len(imu) < 2 or float(np.max(np.std(imu.gyro, axis=0))) < _LEAST_RATE:
+            return None
+        pieces = uninterrupted(Part(list(frames), imu))
         parts = [
             p for p in pieces if len(p.frames) >= _FEWEST_FRAMES and len(p.imu) >= _FEWEST_SAMPLES
         ]
@@ -105,6 +111,28 @@ class ClockWindow:
         """What a fit says of a window."""
         at, sigma_s = fit.values, max(float(fit.sigmas[0]), _LEAST_SIGMA_S)
         return ClockWindow(begin_ns, end_ns, at.offset_s, sigma_s, at.bias, fit.noise_px)
+
+
+def clock_windows(rig: Rig, parts: Sequence[Part]) -> list[ClockWindow]:
+    """Windows of the parts of a recording, in their order; the last of a part may be half as long.
+
+    Args:
+        rig: the calibration.
+        parts: with frames.
+    """
+    found: list[ClockWindow] = []
+    length_ns = round(PART_S * 1e9)
+    for part in parts:
+        stamps = np.array([frame.stamp_ns for frame in part.frames], np.int64)
+        begin_ns = int(stamps[0])
+        while 2 * (int(stamps[-1]) - begin_ns) >= length_ns:
+            inside = (stamps >= begin_ns) & (stamps < begin_ns + length_ns)
+            frames = [part.frames[k] for k in np.flatnonzero(inside)]
+            window = ClockWindow.of(rig, frames, part.imu, found)
+            if window is not None:
+                found.append(window)
+            begin_ns += length_ns
+    return found
 
 
 def clock_change(

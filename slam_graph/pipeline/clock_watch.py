@@ -6,8 +6,6 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-import numpy as np
-
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.pipeline.stage import EstimatedFrame, NoObjects, warn_on_failure
 from slam_graph.results import RunResult
@@ -20,9 +18,6 @@ _WINDOW_NS = 8_000_000_000
 """Length of a window; one at the end of a run is used from half of that on."""
 _SPACING_NS = 90_000_000
 """Time between frames that are looked at."""
-_LEAST_RATE = 0.05
-"""Standard deviation of the angular rate, rad/s, below which a window does not show an offset to
-some milliseconds."""
 
 
 class ClockWatch:
@@ -70,9 +65,7 @@ class ClockWatch:
         imu, rig = ImuData.concatenate(self._samples), self._result.causal_rig
         frames = [frame.usable(1)[0].without(self._objects.moved) for frame in self._frames]
         self._frames, self._samples = [], self._samples[-1:]
-        rates = imu.gyro[np.isfinite(imu.gyro).all(axis=1)]
-        turns = len(rates) > 1 and float(np.max(np.std(rates, axis=0))) > _LEAST_RATE
-        if not (turns and rig.cameras[0].rotation_known):
+        if not rig.cameras[0].rotation_known:
             return
         with warn_on_failure(self._diagnostics, "diagnosis_failed", "a window is left out"):
             window = ClockWindow.of(rig, frames, imu, self._windows)
