@@ -13,18 +13,9 @@ from typing import TYPE_CHECKING
 
 from slam_graph.lazy import lazy_exports
 
-__all__ = ["ClockWindow", "Diagnosis", "Finding", "clock_change"]
+__all__ = ["Diagnosis"]
 
 if TYPE_CHECKING:
-    from slam_graph.diagnosis.clock_windows import ClockWindow, clock_change
     from slam_graph.diagnosis.diagnose import Diagnosis
-    from slam_graph.diagnosis.finding import Finding
 else:
-    __getattr__, __dir__ = lazy_exports(
-        __name__,
-        {
-            "clock_windows": ("ClockWindow", "clock_change"),
-            "diagnose": ("Diagnosis",),
-            "finding": ("Finding",),
-        },
-    )
+    __getattr__, __dir__ = lazy_exports(__name__, {"diagnose": ("Diagnosis",)})

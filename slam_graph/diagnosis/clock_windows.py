@@ -9,7 +9,7 @@ the calibration says, and whatever an estimator has made of it.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -113,56 +113,79 @@ class ClockWindow:
         return ClockWindow(begin_ns, end_ns, at.offset_s, sigma_s, at.bias, fit.noise_px)
 
 
-def clock_windows(rig: Rig, parts: Sequence[Part]) -> list[ClockWindow]:
-    """Windows of the parts of a recording, in their order; the last of a part may be half as long.
+class ClockWindows:
+    """The windows of a recording, in their order."""
 
-    Args:
-        rig: the calibration.
-        parts: with frames.
-    """
-    found: list[ClockWindow] = []
-    length_ns = round(PART_S * 1e9)
-    for part in parts:
-        stamps = np.array([frame.stamp_ns for frame in part.frames], np.int64)
-        begin_ns = int(stamps[0])
-        while 2 * (int(stamps[-1]) - begin_ns) >= length_ns:
-            inside = (stamps >= begin_ns) & (stamps < begin_ns + length_ns)
-            frames = [part.frames[k] for k in np.flatnonzero(inside)]
-            window = ClockWindow.of(rig, frames, part.imu, found)
-            if window is not None:
-                found.append(window)
-            begin_ns += length_ns
-    return found
+    def __init__(self) -> None:
+        self._windows: list[ClockWindow] = []
+
+    def __iter__(self) -> Iterator[ClockWindow]:
+        return iter(self._windows)
+
+    @staticmethod
+    def of(rig: Rig, parts: Sequence[Part]) -> ClockWindows:
+        """Windows of parts of a recording; the last one of a part may be half as long.
+
+        Args:
+            rig: the calibration.
+            parts: with frames.
+        """
+        found = ClockWindows()
+        length_ns = round(PART_S * 1e9)
+        for part in parts:
+            stamps = np.array([frame.stamp_ns for frame in part.frames], np.int64)
+            begin_ns = int(stamps[0])
+            while 2 * (int(stamps[-1]) - begin_ns) >= length_ns:
+                inside = (stamps >= begin_ns) & (stamps < begin_ns + length_ns)
+                frames = [part.frames[k] for k in np.flatnonzero(inside)]
+                found.add(rig, frames, part.imu)
+                begin_ns += length_ns
+        return found
+
+    def add(self, rig: Rig, frames: Sequence[FeatureFrame], imu: ImuData) -> None:
+        """Estimate the offset of the next window, if enough is seen to do so.
+
+        Args:
+            rig: the calibration; its first camera is looked at.
+            frames: of the window, 4 s of them or more.
+            imu: samples over them.
+        """
+        window = ClockWindow.of(rig, frames, imu, self._windows)
+        if window is not None:
+            self._windows.append(window)
+
+    def change(self, lost: Sequence[tuple[int, int]], first_ns: int) -> Finding | None:
+        """The first change of the time offset that is beyond doubt.
+
+        Args:
+            lost: times in which an estimate was lost, ns: windows that reach into them do not
+                count.
+            first_ns: time of the first frame of the recording.
+        """
+        good = [
+            w
+            for w in self._windows
+            if not any(begin < w.end_ns and w.begin_ns < end for begin, end in lost)
+        ]
+        for k, window in enumerate(good):
+            before = _mean(good[:k])
+            if before is not None and window.differs and _are_apart(before, window):
+                return _found(before, window, first_ns)
+        return None
 
 
-def clock_change(
-    windows: Sequence[ClockWindow], lost: Sequence[tuple[int, int]], first_ns: int
-) -> Finding | None:
-    """The first change of the time offset that is beyond doubt.
-
-    Args:
-        windows: in their order.
-        lost: times in which an estimate was lost, ns: windows that reach into them do not count.
-        first_ns: time of the first frame.
-    """
-    good = [
-        w for w in windows if not any(begin < w.end_ns and w.begin_ns < end for begin, end in lost)
-    ]
-    for k, window in enumerate(good):
-        before = _mean(good[:k])
-        if before is None or not (window.differs and _are_apart(before, window)):
-            continue
-        change_s, sigma_s = _difference(before, window)
-        at_s = (window.begin_ns - first_ns) * 1e-9
-        what = (
-            f"the time offset between camera and IMU changes at about t = {at_s:.0f} s, from "
-            f"{1e3 * before.offset_s:.1f} to {1e3 * window.offset_s:.1f} ± {1e3 * sigma_s:.1f} ms"
-        )
-        fix = "look for late or jumping stamps of the IMU or the camera; run the parts apart"
-        values = {"at_s": at_s, "before_s": before.offset_s, "after_s": window.offset_s}
-        sigmas = abs(change_s) / sigma_s
-        return Finding.measured("time_offset_change", "error", what, fix, sigmas, values)
-    return None
+def _found(before: ClockWindow, after: ClockWindow, first_ns: int) -> Finding:
+    """The finding of a change."""
+    change_s, sigma_s = _difference(before, after)
+    at_s = (after.begin_ns - first_ns) * 1e-9
+    what = (
+        f"the time offset between camera and IMU changes at about t = {at_s:.0f} s, from "
+        f"{1e3 * before.offset_s:.1f} to {1e3 * after.offset_s:.1f} ± {1e3 * sigma_s:.1f} ms"
+    )
+    fix = "look for late or jumping stamps of the IMU or the camera; run the parts apart"
+    values = {"at_s": at_s, "before_s": before.offset_s, "after_s": after.offset_s}
+    sigmas = abs(change_s) / sigma_s
+    return Finding.measured("time_offset_change", "error", what, fix, sigmas, values)
 
 
 def _mean(windows: Sequence[ClockWindow]) -> ClockWindow | None:

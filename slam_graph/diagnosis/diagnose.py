@@ -12,7 +12,7 @@ import numpy as np
 from slam_graph.arrays import FloatArray
 from slam_graph.datasets import RecordedSequence
 from slam_graph.diagnosis.camera_and_gyroscope import compare, refine
-from slam_graph.diagnosis.clock_windows import clock_change, clock_windows
+from slam_graph.diagnosis.clock_windows import ClockWindows
 from slam_graph.diagnosis.finding import Finding, in_order
 from slam_graph.diagnosis.frame_checks import check_images, check_stamps, check_tracks
 from slam_graph.diagnosis.gathering import Material, Part, around, gather, uninterrupted
@@ -52,7 +52,10 @@ class Diagnosis:
 
     Attributes:
         findings: errors first, and among equals the plainest cause first.
+        Clocks: the time offset in one window of a recording after another.
     """
+
+    Clocks = ClockWindows
 
     findings: list[Finding]
 
@@ -69,8 +72,8 @@ class Diagnosis:
         material = gather(recording)
         found = _judged(material)
         if material.rig.has_imu and material.rig.cameras[0].rotation_known:
-            windows = clock_windows(material.rig, material.parts)
-            change = clock_change(windows, (), recording.info().start_ns)
+            windows = ClockWindows.of(material.rig, material.parts)
+            change = windows.change((), recording.info().start_ns)
             if change is not None:  # one offset for the whole recording says less
                 found = [change, *(f for f in found if f.kind != "time_offset")]
         return Diagnosis(in_order(found))

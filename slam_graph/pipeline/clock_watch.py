@@ -12,7 +12,7 @@ from slam_graph.results import RunResult
 from slam_graph.sensors import FeatureFrame, ImuData
 
 if TYPE_CHECKING:
-    from slam_graph.diagnosis import ClockWindow, Finding
+    from slam_graph.diagnosis import Diagnosis
 
 _WINDOW_NS = 8_000_000_000
 """Length of a window; one at the end of a run is used from half of that on."""
@@ -35,7 +35,7 @@ class ClockWatch:
         self._result, self._objects, self._diagnostics = result, objects, diagnostics
         self._frames: list[FeatureFrame] = []
         self._samples: list[ImuData] = []
-        self._windows: list[ClockWindow] = []
+        self._windows: Diagnosis.Clocks | None = None
         self._losses = 0
 
     def add(self, frame: EstimatedFrame) -> None:
@@ -49,25 +49,28 @@ class ClockWatch:
         if not self._frames or features.stamp_ns - self._frames[-1].stamp_ns >= _SPACING_NS:
             self._frames.append(FeatureFrame(features.stamp_ns, features.cameras[:1]))
 
-    def change(self) -> Finding | None:
-        """The first change that is beyond doubt, if there is one; called at the end of the run."""
-        from slam_graph.diagnosis import clock_change  # it takes a moment to import
+    def finish(self) -> Diagnosis:
+        """A finding of the first change that is beyond doubt, if there is one."""
+        from slam_graph.diagnosis import Diagnosis  # it takes a moment to import
 
         frames, result = self._frames, self._result
         if frames and 2 * (frames[-1].stamp_ns - frames[0].stamp_ns) >= _WINDOW_NS:
             self._close()
-        return clock_change(self._windows, result.segments.losses, result.input.start_ns)
+        if self._windows is None:
+            return Diagnosis([])
+        change = self._windows.change(result.segments.losses, result.input.start_ns)
+        return Diagnosis([] if change is None else [change])
 
     def _close(self) -> None:
         """Estimate the offset of the present window, and begin another one."""
-        from slam_graph.diagnosis import ClockWindow
+        from slam_graph.diagnosis import Diagnosis
 
         imu, rig = ImuData.concatenate(self._samples), self._result.causal_rig
         frames = [frame.usable(1)[0].without(self._objects.moved) for frame in self._frames]
         self._frames, self._samples = [], self._samples[-1:]
         if not rig.cameras[0].rotation_known:
             return
+        if self._windows is None:
+            self._windows = Diagnosis.Clocks()
         with warn_on_failure(self._diagnostics, "diagnosis_failed", "a window is left out"):
-            window = ClockWindow.of(rig, frames, imu, self._windows)
-            if window is not None:
-                self._windows.append(window)
+            self._windows.add(rig, frames, imu)

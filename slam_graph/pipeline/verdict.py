@@ -25,7 +25,7 @@ from slam_graph.results import RunResult
 from slam_graph.sensors import CameraFrame, FeatureFrame, ImuData, Rig
 
 if TYPE_CHECKING:
-    from slam_graph.diagnosis import Diagnosis, Finding
+    from slam_graph.diagnosis import Diagnosis
 
 _KEPT_NS = 24_000_000_000
 """So much of the recording is looked at: what came after the start, as far as it goes."""
@@ -170,9 +170,9 @@ class Verdict(Stage):
         with warn_on_failure(self._diagnostics, "diagnosis_failed", "evidence is left out"):
             unusual, contradictions = self._contradictions()
         with warn_on_failure(self._diagnostics, "diagnosis_failed", "the cause is not looked for"):
-            change = self._clocks.change()
-            if failed or unusual or change is not None or self._is_doubtful():
-                self._judge(failed, contradictions, change)
+            clocks = self._clocks.finish()
+            if failed or unusual or clocks.findings or self._is_doubtful():
+                self._judge(failed, contradictions, clocks)
 
     def _contradictions(self) -> tuple[bool, list[str]]:
         """Whether the run by itself is unlike good ones, and what shows if that is beyond doubt.
@@ -231,20 +231,20 @@ class Verdict(Stage):
         ]
         return "; or ".join(certain[:2])
 
-    def _judge(self, failed: bool, contradictions: list[str], change: Finding | None) -> None:
+    def _judge(self, failed: bool, contradictions: list[str], clocks: Diagnosis) -> None:
         """Diagnose what was recorded, under the calibration that the run began or ended with.
 
         Args:
             failed: whether the run did.
             contradictions: what shows in the run itself, if that is beyond doubt.
-            change: of the time offset; an offset that is one for the whole run says less then.
+            clocks: a change of the time offset, if there is one; a single offset for the whole run
+                says less then.
         """
         found = self._diagnosed(self._result.input.rig if failed else self._final_rig())
         ending, faults = self._result.ending, found.setup_faults
-        guess = found.best_guess()
-        if change is not None:
-            guess = f"{change.what}; {change.fix}"
-            faults = [change, *(finding for finding in faults if finding.kind != "time_offset")]
+        guess = clocks.best_guess() or found.best_guess()
+        if clocks.findings:
+            faults = clocks.findings + [fault for fault in faults if fault.kind != "time_offset"]
         if failed and guess:
             ending.message += f"; slam-graph doctor says: {guess}"
         elif faults and not failed:
