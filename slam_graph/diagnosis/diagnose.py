@@ -52,10 +52,10 @@ class Diagnosis:
 
     Attributes:
         findings: errors first, and among equals the plainest cause first.
-        Clocks: the time offset in one window of a recording after another.
     """
 
-    Clocks = ClockWindows
+    class Clocks(ClockWindows):
+        """The time offset in one window of a recording after another."""
 
     findings: list[Finding]
 
