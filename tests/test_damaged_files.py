@@ -19,6 +19,7 @@ from hypothesis import strategies as st
 from map_flights import World
 from pose_graphs import laps
 from recordings import CAMERA_YAML, write_euroc, write_openvins
+from recordings_loose import write_flight_video, write_video
 from recordings_public import write_kitti_raw, write_tum_rgbd
 from recordings_ros import write_bag
 
@@ -307,3 +308,18 @@ def test_bags(tmp_path: Path, kind: str, examples: int) -> None:
     path = write_bag(tmp_path, kind, frames=2)
     file = path if path.is_file() else next(path.glob("*.db3"))
     tried(file, lambda: read_all(path), examples)
+
+
+@pytest.mark.parametrize(
+    ("name", "codec"),
+    [("flight.mkv", "FFV1"), ("flight.avi", "MJPG"), ("flight.mp4", "mp4v")],
+)
+def test_videos(tmp_path: Path, name: str, codec: str) -> None:
+    path = write_video(tmp_path, name, codec)
+    tried(path, lambda: read_all(path), 40)
+
+
+@pytest.mark.parametrize("name", ["flight.csv", "flight.imu.csv", "flight.yaml"])
+def test_what_lies_beside_a_video(tmp_path: Path, name: str) -> None:
+    path = write_flight_video(tmp_path)
+    tried(tmp_path / name, lambda: read_all(path), 40)

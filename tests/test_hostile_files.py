@@ -11,7 +11,8 @@ from zlib import crc32
 
 import numpy as np
 import pytest
-from recordings import write_euroc
+from recordings import write_euroc, write_openvins
+from recordings_loose import write_times, write_video
 from recordings_public import write_tum_rgbd
 from recordings_ros import bag_writer, write_bag
 from typer.testing import CliRunner
@@ -350,6 +351,31 @@ def test_a_compressed_problem_unpacks_within_a_bound(tmp_path: Path) -> None:
     path.write_bytes(bz2.compress(b"1 1 1\n" + b" " * 10**7))
     with pytest.raises(DataError, match="unpacks to more than 50 times"):
         read_bal(path)
+
+
+def test_a_video_that_claims_too_many_frames_is_counted(tmp_path: Path) -> None:
+    path = write_video(tmp_path, "flight.avi", "MJPG")
+    write_times(path.with_suffix(".csv"))
+    content = bytearray(path.read_bytes())
+    for header, field in ((b"avih", 16), (b"strh", 32)):
+        at = content.find(header) + 8 + field
+        content[at : at + 4] = (900_000_000).to_bytes(4, "little")
+    path.write_bytes(content)
+    assert open_dataset(path).info().frames == 8
+
+
+def test_a_sigma_with_two_points_is_read_as_far_as_it_is_a_number(tmp_path: Path) -> None:
+    folder = write_openvins(tmp_path / "flight", frames=4, features=5)
+    start = folder / "init_state.csv"
+    whole = open_dataset(folder).initial_state()
+    assert whole is not None
+    text = start.read_text()
+    assert "bg 0.03," in text
+    for damaged in ("0.03.", "0.03.1", "0.03.e2"):
+        start.write_text(text.replace("bg 0.03,", f"bg {damaged},"))
+        again = open_dataset(folder).initial_state()
+        assert again is not None
+        np.testing.assert_array_equal(again.covariance, whole.covariance)
 
 
 # --- names of other files -------------------------------------------------------------------------

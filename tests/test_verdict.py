@@ -5,6 +5,7 @@
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import gtsam
 import numpy as np
@@ -14,10 +15,11 @@ from typer.testing import CliRunner
 from slam_graph.cli.main import app
 from slam_graph.datasets import kalibr_text
 from slam_graph.datasets.dataset_registry import open_dataset
+from slam_graph.datasets.faults.injection import inject
 from slam_graph.datasets.memory_sequence import dataset_from_arrays
 from slam_graph.datasets.sequence import RecordedSequence
 from slam_graph.diagnosis import Diagnosis, run_evidence
-from slam_graph.pipeline import verdict
+from slam_graph.pipeline import recovery, verdict
 from slam_graph.pipeline.run_recording import run
 from slam_graph.sensors.measurements import FeatureFrame
 from slam_graph.sensors.rig import Rig, RigCamera
@@ -224,3 +226,32 @@ def test_a_run_that_contradicts_itself_is_suspect(
     assert ("away from the causal one" in result.message) == with_imu
     assert result.evidence is not None
     assert (result.evidence["position_shift"] is not None) == with_imu
+
+
+@pytest.mark.parametrize("ending", ["limits.recovery=false", "the segment is too short"])
+def test_what_follows_the_loss_that_ends_a_run_is_not_compared(
+    ending: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The platform is somewhere else then, which no calibration explains."""
+    asked: list[list[tuple[int, int]]] = []
+    diagnose = Diagnosis.of_tracks
+
+    def noted(*arguments: Any) -> Diagnosis:
+        asked.append(list(arguments[4]))
+        return diagnose(*arguments)
+
+    monkeypatch.setattr(Diagnosis, "of_tracks", noted)
+    monkeypatch.setattr(recovery, "_MOST_SHORT", 1)
+    jump_s = 4.5
+    flight = simulate(trajectory="figure8", cameras=2, duration_s=12.0, seed=1)
+    jumped = inject(flight, [f"kidnapped:at_s={jump_s},duration_s=2.5"])
+    settings = (*CAUSAL, ending) if "=" in ending else CAUSAL
+    result = run(jumped, overrides=settings)
+    assert result.status == "diverged"
+    assert len(result.segments) == 1
+    assert asked == [result.segments.losses]
+    (begin_ns, end_ns) = asked[0][0]
+    seconds = [(at - result.input.start_ns) * 1e-9 for at in (begin_ns, end_ns)]
+    assert seconds[0] < jump_s < seconds[1]
+    assert seconds[1] == pytest.approx(result.logs.frames / 20.0, abs=0.06), "the last frame"
+    assert "slam-graph doctor says" not in result.message

@@ -40,17 +40,17 @@ _FITS, _NOTHING_FITS = 0.3, 0.5
 """… and below this to be taken; beyond this nothing fits."""
 _TURNED_RAD = np.deg2rad(20.0)
 """A mounting that is farther off is looked for coarsely first."""
-_SIGMAS = 6.0
+SIGMAS = 6.0
 """A difference is a finding from so many standard deviations on, and if it is larger than these,
 which grow with the square of the noise in pixels above 1 px, as the bias by the noise does:"""
-_OFFSET_S, _BAD_OFFSET_S = 5e-3, 1.5e-2
+_OFFSET_S, BAD_OFFSET_S = 5e-3, 1.5e-2
 _FOCAL, _BAD_FOCAL = 0.02, 0.025
 _TURN_RAD, _BAD_TURN_RAD = np.deg2rad(1.2), np.deg2rad(1.5)
 _READOUT_S = 8e-3
 _NAMED_RAD = np.deg2rad(4.0)
 """So near a named explanation must come to a mounting that was found."""
-_FEWEST_PAIRS = 10
-_CLEARLY = 1.05
+FEWEST_PAIRS = 10
+CLEARLY = 1.05
 """The noise of one fit is clearly larger than that of another by this factor."""
 _FOCAL_STARTS = (1.0, 0.77, 1.3)
 _GOOD_PX = 1.5
@@ -87,7 +87,7 @@ def compare(rig: Rig, parts: list[Part]) -> CameraAndGyroscope:
     camera = rig.cameras[0]
     pairs = frame_pairs(now.parts, now.gyroscopes, camera)
     turning = _turning(now, pairs)
-    if turning is None or len(pairs) < _FEWEST_PAIRS:
+    if turning is None or len(pairs) < FEWEST_PAIRS:
         text = "the camera turns too little to check clock, mounting and focal length"
         now.findings.append(Finding("turns_too_little", "info", text, "record livelier motion"))
         return now
@@ -115,7 +115,7 @@ def refine(rig: Rig, parts: list[Part]) -> CameraAndGyroscope:
     now = CameraAndGyroscope(rig, parts, [Gyroscope(part.imu) for part in parts])
     camera = rig.cameras[0]
     pairs = frame_pairs(now.parts, now.gyroscopes, camera, turns=False)
-    if len(pairs) < _FEWEST_PAIRS:
+    if len(pairs) < FEWEST_PAIRS:
         return now
     start = _calibrated(camera)
     problem = RotationProblem(pairs, now.gyroscopes, camera)
@@ -134,11 +134,11 @@ def _calibration_is_better(problem: RotationProblem, start: Kinematics, fit: Rot
     Gauss-Newton minimises weighted squares, and a few pairs that hardly move can lead it away.
     """
     calibrated = problem.noise_px(start)
-    if calibrated * _CLEARLY > fit.noise_px:
+    if calibrated * CLEARLY > fit.noise_px:
         with suppress(np.linalg.LinAlgError):
             bias = problem.solve(start, ("bx", "by", "bz"))
             calibrated = min(calibrated, bias.noise_px)
-    return calibrated * _CLEARLY < fit.noise_px
+    return calibrated * CLEARLY < fit.noise_px
 
 
 def _turning(now: CameraAndGyroscope, pairs: list[FramePair]) -> Turning | None:
@@ -238,7 +238,7 @@ def _judge(now: CameraAndGyroscope, fit: RotationFit) -> None:
     _judge_readout(now, fit, sigma["readout"])
     camera = now.rig.cameras[0]
     change_s = fit.values.offset_s - camera.clock_offset_s
-    if abs(change_s) > max(_OFFSET_S * _noisier(fit), _SIGMAS * sigma["offset"]):
+    if abs(change_s) > max(_OFFSET_S * _noisier(fit), SIGMAS * sigma["offset"]):
         value = camera.time_offset_s + change_s
         what = (
             f"the clocks of camera and IMU differ by {1e3 * value:.1f} ± "
@@ -249,7 +249,7 @@ def _judge(now: CameraAndGyroscope, fit: RotationFit) -> None:
             f"timeshift_cam_imu: {value:.4f} in the calibration, or "
             "--set backend.calibration.time_offset=true"
         )
-        severity = graded(abs(change_s) > _BAD_OFFSET_S)
+        severity = graded(abs(change_s) > BAD_OFFSET_S)
         values = {"time_offset_s": value, "sigma_s": sigma["offset"]}
         now.findings.append(
             Finding.measured(
@@ -278,7 +278,7 @@ def _judge_mounting(now: CameraAndGyroscope, fit: RotationFit) -> None:
     turn, covariance = fit.turn_from(R)
     away = float(np.linalg.norm(turn))
     sigmas = float(np.sqrt(turn @ np.linalg.solve(covariance, turn)))
-    if away < _TURN_RAD * _noisier(fit) or sigmas < _SIGMAS:
+    if away < _TURN_RAD * _noisier(fit) or sigmas < SIGMAS:
         return
     sigma = away / sigmas
     named = explained(fit.values.body_R_camera, R)
@@ -316,7 +316,7 @@ def _judge_readout(now: CameraAndGyroscope, fit: RotationFit, sigma: float) -> N
     """Whether rows are exposed one after the other, and the calibration does not say so."""
     camera = now.rig.cameras[0]
     change = fit.values.readout_s - camera.readout_s
-    if abs(change) < max(_READOUT_S * _noisier(fit), _SIGMAS * sigma):
+    if abs(change) < max(_READOUT_S * _noisier(fit), SIGMAS * sigma):
         return
     value = fit.values.readout_s
     what = (
@@ -336,7 +336,7 @@ def _judge_focal(now: CameraAndGyroscope, fit: RotationFit, sigma: float) -> Non
     """Whether the focal length is wrong; that of all cameras is corrected then."""
     factor = fit.values.focal
     change = abs(float(np.log(factor)))
-    if change < max(_FOCAL * _noisier(fit), _SIGMAS * sigma):
+    if change < max(_FOCAL * _noisier(fit), SIGMAS * sigma):
         return
     camera = now.rig.cameras[0].camera
     what = (

@@ -12,6 +12,7 @@ import numpy as np
 from slam_graph.arrays import FloatArray
 from slam_graph.datasets import RecordedSequence
 from slam_graph.diagnosis.camera_and_gyroscope import compare, refine
+from slam_graph.diagnosis.clock_windows import ClockWindows
 from slam_graph.diagnosis.finding import Finding, in_order
 from slam_graph.diagnosis.frame_checks import check_images, check_stamps, check_tracks
 from slam_graph.diagnosis.gathering import Material, Part, around, gather, uninterrupted
@@ -32,6 +33,7 @@ SETUP_KINDS = (
     "gyroscope_axes",
     "mounting",
     "time_offset",
+    "time_offset_change",
     "focal_length",
     "stereo_geometry",
     "baseline",
@@ -52,6 +54,9 @@ class Diagnosis:
         findings: errors first, and among equals the plainest cause first.
     """
 
+    class Clocks(ClockWindows):
+        """The time offset in one window of a recording after another."""
+
     findings: list[Finding]
 
     @staticmethod
@@ -64,7 +69,14 @@ class Diagnosis:
         Args:
             recording: images or tracks.
         """
-        return Diagnosis(in_order(_judged(gather(recording))))
+        material = gather(recording)
+        found = _judged(material)
+        if material.rig.has_imu and material.rig.cameras[0].rotation_known:
+            windows = ClockWindows.of(material.rig, material.parts)
+            change = windows.change((), recording.info().start_ns)
+            if change is not None:  # one offset for the whole recording says less
+                found = [change, *(f for f in found if f.kind != "time_offset")]
+        return Diagnosis(in_order(found))
 
     @staticmethod
     def quick(recording: RecordedSequence) -> Diagnosis:

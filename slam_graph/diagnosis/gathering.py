@@ -21,7 +21,7 @@ from slam_graph.diagnostics import Diagnostics
 from slam_graph.frontend import FrontendConfig, build_frontend
 from slam_graph.sensors import CameraFrame, FeatureFrame, ImuData, Rig
 
-_PART_S = 8.0
+PART_S = 8.0
 """Length of a part."""
 _PARTS = 3
 """Most parts."""
@@ -144,7 +144,7 @@ def uninterrupted(part: Part, lost: Sequence[tuple[int, int]] = ()) -> list[Part
 
 def chosen_parts(start_ns: int, end_ns: int, imu: ImuData) -> list[tuple[int, int]]:
     """Beginning and end of the parts to look at: all of a short recording, else where it turns."""
-    length_ns = round(_PART_S * 1e9)
+    length_ns = round(PART_S * 1e9)
     if end_ns - start_ns <= _PARTS * length_ns:
         return [(start_ns, end_ns)]
     begins = np.arange(start_ns, end_ns - length_ns, length_ns, dtype=np.int64)

@@ -38,7 +38,7 @@ _JUMP = 0.6
 _CAUCHY = 2.4
 """Residual with half the weight, in units of the noise."""
 _SIGMA_OF_MEDIAN = 1.4826
-_MOST_STEPS = 15
+_MOST_STEPS, _PRECISION = 15, 1e-3
 _DIRECTIONS = 4
 """How often a direction is found again without wrong matches."""
 _BLOCK_S = 2.0
@@ -248,8 +248,20 @@ class RotationProblem:
         known = self.bearings(at.focal)[2]
         return _noise(e[known]) if known.any() else np.inf
 
-    def solve(self, start: Kinematics, free: tuple[str, ...] = UNKNOWNS) -> RotationFit:
-        """Gauss-Newton from a start; what is not free stays as it is."""
+    def solve(
+        self,
+        start: Kinematics,
+        free: tuple[str, ...] = UNKNOWNS,
+        precision: float = _PRECISION,
+    ) -> RotationFit:
+        """Gauss-Newton from a start.
+
+        Args:
+            start: values of the unknowns.
+            free: which of them are estimated; the others stay as they are.
+            precision: steps end where no unknown changes by more than this part of the largest
+                change that it may have.
+        """
         columns = [k for k, name in enumerate(UNKNOWNS) if name in free]
         at, noise = start, self.noise_px(start)
         weight = 1.0 / _PRIOR[columns] ** 2
@@ -273,7 +285,7 @@ class RotationProblem:
                 tried = at.moved(change)
                 lower = self.noise_px(tried)
             at, noise = tried, lower
-            if np.all(np.abs(change) < 0.1 * _LARGEST * 1e-2):
+            if np.all(np.abs(change) < precision * _LARGEST):
                 break
         covariance = np.diag(np.full(9, np.inf))
         covariance[np.ix_(columns, columns)] = _covariance(information, scores, np.diag(weight))

@@ -143,7 +143,7 @@ class Estimation:
         try:
             state = self._solve(tracked)
         except DivergenceError as error:
-            self._recovery.begin_segment(error)
+            self._recovery.begin_segment(error, tracked.features.stamp_ns)
             self._start = KnownStart()
             self._result.start_was_given &= len(self._result.segments) > 0
             state, lost = None, True

@@ -94,19 +94,23 @@ class Recovery:
             message = f"lost at frame {stamp_ns}: nothing was recorded for {blind_s:.1f} s"
             raise DivergenceError(message)
 
-    def begin_segment(self, lost: DivergenceError) -> None:
+    def begin_segment(self, lost: DivergenceError, noticed_ns: int) -> None:
         """End the segment where the images last agreed with it, and start again.
 
         Args:
             lost: why.
+            noticed_ns: time of the frame at which that was noticed.
 
         Raises:
             DivergenceError: the same, if a new start has no prospect or is not wanted.
         """
         result = self._result
+        good_ns = self._good_until()
+        if good_ns is not None:
+            result.segments.losses.append((good_ns, noticed_ns))
         if not result.config.limits.recovery:
             raise lost
-        good_ns = self._forget_bad_states(self._agreement.agreed_until())
+        self._forget_bad_states(good_ns)
         before = self._recent[-1] if self._recent else None
         lasted_s = result.segments.end(good_ns, str(lost))
         end_ns = result.segments[-1].end_ns if len(result.segments) else None
@@ -118,16 +122,19 @@ class Recovery:
         self._estimator.begin_segment(before, measured=not isinstance(lost, JumpError))
         self._diagnostics.warn("new_segment", f"{lost}; the run starts again from here")
 
-    def _forget_bad_states(self, good_ns: int | None) -> int | None:
-        """Forget the states of the present segment after a time, or all of them.
+    def _good_until(self) -> int | None:
+        """Until when the states of the present segment are good; None if none is."""
+        segments, agreed_ns = self._result.segments, self._agreement.agreed_until()
+        if not segments.goes_on or agreed_ns is None:
+            return None
+        good_ns = agreed_ns - _MARGIN_NS
+        return good_ns if good_ns > segments[-1].begin_ns else None
 
-        Returns:
-            Until when its states are good; None if none is.
-        """
+    def _forget_bad_states(self, good_ns: int | None) -> None:
+        """Forget the states of the present segment after a time, or all of them if it is None."""
         segments = self._result.segments
         if not segments.goes_on:
-            return None
-        last_ns = segments[-1].begin_ns - 1 if good_ns is None else good_ns - _MARGIN_NS
+            return
+        last_ns = segments[-1].begin_ns - 1 if good_ns is None else good_ns
         while self._recent and self._recent[-1].stamp_ns > last_ns:
             self._recent.pop()
-        return None if good_ns is None else last_ns

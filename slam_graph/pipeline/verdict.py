@@ -19,6 +19,7 @@ import numpy as np
 
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import DataError, EstimationError
+from slam_graph.pipeline.clock_watch import ClockWatch
 from slam_graph.pipeline.stage import COMPLETED, EstimatedFrame, NoObjects, Stage, warn_on_failure
 from slam_graph.results import RunResult
 from slam_graph.sensors import CameraFrame, FeatureFrame, ImuData, Rig
@@ -122,9 +123,10 @@ class Verdict(Stage):
         self, result: RunResult, diagnostics: Diagnostics, objects: NoObjects | None = None
     ) -> None:
         self._result, self._diagnostics = result, diagnostics
-        self._kept = _Memory(len(result.input.rig.cameras) > 1, objects or NoObjects())
+        objects = objects or NoObjects()
+        self._kept = _Memory(len(result.input.rig.cameras) > 1, objects)
+        self._clocks = ClockWatch(result, objects, diagnostics)
         self._estimated = self._at_limit = 0  # frames with a state; noise of the IMU at its limit
-        self._lost: list[tuple[int, int]] = []  # last good states, and when a loss was noticed
         self._started_ns: int | None = None
         self._first_ns: int | None = None
         config = result.config
@@ -133,16 +135,15 @@ class Verdict(Stage):
         self._look_ns = _FIRST_LOOK_NS if refusing else None
 
     def frame(self, frame: EstimatedFrame) -> None:
-        """Keep a frame, unless there are enough after the start.
+        """Keep a frame, unless there are enough after the start, and watch the clocks.
 
         Raises:
             DataError: if the run waits for its first state, and what it was given is certainly
                 wrong.
         """
-        stamp_ns, segments = frame.features.stamp_ns, self._result.segments
-        ended = [segment.end_ns for segment in segments if segment.ended_by]
-        if len(ended) > len(self._lost):
-            self._lost.append((ended[-1], stamp_ns))
+        stamp_ns = frame.features.stamp_ns
+        if self._result.input.rig.has_imu:
+            self._clocks.add(frame)
         if frame.restarted:
             self._estimated = self._at_limit = 0
         self._estimated += frame.initialized
@@ -169,8 +170,9 @@ class Verdict(Stage):
         with warn_on_failure(self._diagnostics, "diagnosis_failed", "evidence is left out"):
             unusual, contradictions = self._contradictions()
         with warn_on_failure(self._diagnostics, "diagnosis_failed", "the cause is not looked for"):
-            if failed or unusual or self._is_doubtful():
-                self._judge(failed, contradictions)
+            clocks = self._clocks.finish()
+            if failed or unusual or clocks.findings or self._is_doubtful():
+                self._judge(failed, contradictions, clocks)
 
     def _contradictions(self) -> tuple[bool, list[str]]:
         """Whether the run by itself is unlike good ones, and what shows if that is beyond doubt.
@@ -229,19 +231,24 @@ class Verdict(Stage):
         ]
         return "; or ".join(certain[:2])
 
-    def _judge(self, failed: bool, contradictions: list[str]) -> None:
+    def _judge(self, failed: bool, contradictions: list[str], clocks: Diagnosis) -> None:
         """Diagnose what was recorded, under the calibration that the run began or ended with.
 
         Args:
             failed: whether the run did.
             contradictions: what shows in the run itself, if that is beyond doubt.
+            clocks: a change of the time offset, if there is one; a single offset for the whole run
+                says less then.
         """
         found = self._diagnosed(self._result.input.rig if failed else self._final_rig())
-        ending, guess = self._result.ending, found.best_guess()
+        ending, faults = self._result.ending, found.setup_faults
+        guess = clocks.best_guess() or found.best_guess()
+        if clocks.findings:
+            faults = clocks.findings + [fault for fault in faults if fault.kind != "time_offset"]
         if failed and guess:
             ending.message += f"; slam-graph doctor says: {guess}"
-        elif found.setup_faults and not failed:
-            likely = "; or ".join(finding.what for finding in found.setup_faults[:2])
+        elif faults and not failed:
+            likely = "; or ".join(finding.what for finding in faults[:2])
             self._suspect(f"{likely}; see `slam-graph doctor`")
         elif contradictions and not failed:
             self._suspect("; and ".join(contradictions))
@@ -260,7 +267,9 @@ class Verdict(Stage):
         from slam_graph.diagnosis import Diagnosis  # it takes a moment to import
 
         kept = self._kept
-        return Diagnosis.of_tracks(rig, kept.frames, kept.imu, kept.pairs, self._lost)
+        return Diagnosis.of_tracks(
+            rig, kept.frames, kept.imu, kept.pairs, self._result.segments.losses
+        )
 
     def _final_rig(self) -> Rig:
         """The rig as calibrated, corrected or estimated, whichever came last."""
@@ -278,5 +287,7 @@ class Verdict(Stage):
         kept = self._kept
         if kept.pairs and kept.shared < _FEWEST_SHARED:
             return True
-        looked = Diagnosis.nearby(self._final_rig(), kept.frames, kept.imu, self._lost)
+        looked = Diagnosis.nearby(
+            self._final_rig(), kept.frames, kept.imu, self._result.segments.losses
+        )
         return bool(looked.setup_faults)

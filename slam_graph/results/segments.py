@@ -101,10 +101,14 @@ class Segments:
 
     Attributes:
         lost: why the estimate was lost, the last time that it was; empty if it never was.
+        losses: times of which it is not known what happened, ns: from the last good state before
+            each loss to where that was noticed, whether the run went on or not. A segment from
+            which nothing was good adds none.
     """
 
     def __init__(self) -> None:
         self.lost = ""
+        self.losses: list[tuple[int, int]] = []
         self._all: list[Segment] = []
 
     def __len__(self) -> int:

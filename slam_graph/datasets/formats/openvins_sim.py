@@ -131,7 +131,9 @@ def _prior_covariance(text: str) -> NDArray[np.float64]:
     _, _, stated = text.partition("prior sigma")
     sigmas = _DEFAULT_SIGMAS | {
         name: float(value)
-        for name, value in re.findall(r"\b(q|p|v|bg|ba) ([0-9.]+(?:e[-+]?\d+)?)", stated)
+        for name, value in re.findall(
+            r"\b(q|p|v|bg|ba) ([0-9]+(?:\.[0-9]*)?(?:e[-+]?[0-9]+)?)", stated
+        )
     }
     return np.diag(np.repeat([sigmas[name] ** 2 for name in _COVARIANCE_ORDER], 3))
 

@@ -64,12 +64,16 @@ class _VideoReader:
         if not self._capture.isOpened():
             raise DataError(f"{path}: this video cannot be opened; it is damaged or not a video")
         self._next = 0
+        self._most = path.stat().st_size
 
     @property
     def count(self) -> int | None:
-        """Number of frames according to the container; None if it gives none."""
+        """Number of frames according to the container; None if it gives none that can be true.
+
+        There are no more frames than bytes.
+        """
         count = self._capture.get(cv2.CAP_PROP_FRAME_COUNT)
-        return int(count) if 0 < count < 1e9 else None
+        return int(count) if 0 < count <= self._most else None
 
     @property
     def rate_hz(self) -> float | None:
