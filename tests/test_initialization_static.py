@@ -81,6 +81,28 @@ def test_tilt_and_accelerometer_bias_are_uncertain_together(roll: float, pitch: 
     assert np.sqrt(np.max(gained)) < 2.0 * 9.81 * PRIOR.attitude_rad
 
 
+def test_vibration_at_rest_makes_the_tilt_uncertain() -> None:
+    """NEES of the tilt under vibration of 1 m/s² that is correlated over 20 ms."""
+    rng = np.random.default_rng(4)
+    samples, up = at_rest(0.3, -0.2, np.zeros(3))
+    R, across = level_rotation(9.81 * up).matrix(), null_space(up[None]).T
+    memory = np.exp(-0.005 / 0.02)
+    squares = []
+    for _ in range(200):
+        vibration = rng.normal(size=(len(samples.accel), 3))
+        for k in range(1, len(vibration)):
+            new = np.sqrt(1.0 - memory**2) * vibration[k]
+            vibration[k] = memory * vibration[k - 1] + new
+        moving = ImuData(samples.stamps_ns, samples.gyro, samples.accel + vibration)
+        state = state_at_rest(moving, 10**9, PRIOR)
+        assert state.covariance is not None
+        estimated = state.world_T_body.rotation().matrix()
+        turn = across @ gtsam.Rot3.Logmap(gtsam.Rot3(estimated.T @ R))
+        P = across @ state.covariance[:3, :3] @ across.T
+        squares.append(turn @ np.linalg.solve(P, turn))
+    assert 1.2 < np.mean(squares) < 4.0  # 2 is ideal; nine degrees of freedom know the scatter
+
+
 def test_an_accelerometer_that_measures_nothing_levels_nothing() -> None:
     none = ImuData(np.arange(200) * 5_000_000, np.zeros((200, 3)), np.zeros((200, 3)))
     covariance = state_at_rest(none, 10**9, PRIOR).covariance

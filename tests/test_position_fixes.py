@@ -401,3 +401,19 @@ def test_a_truth_is_in_the_world_of_the_fixes_or_not() -> None:
     assert not is_in_world_of_fixes(moved.apply(truth), sequence.aiding)
     assert not is_in_world_of_fixes(None, sequence.aiding)
     assert not is_in_world_of_fixes(truth, AidingData.empty())
+
+
+@pytest.mark.parametrize(("sigma_m", "shift_m"), [(0.3, 0.5), (2.0, 8.0)])
+def test_the_noise_of_fixes_does_not_hide_another_world(sigma_m: float, shift_m: float) -> None:
+    """On a path of 6 m, which fixes of 2 m do not resolve."""
+    truth = simulate(trajectory="figure8", duration_s=20.0, rate_hz=10.0, seed=1).groundtruth()
+    assert truth is not None
+    some, rng = slice(2, -2, 2), np.random.default_rng(0)
+    fixes = truth.positions[some] + rng.normal(0.0, sigma_m, truth.positions[some].shape)
+    covariances = np.tile(sigma_m**2 * np.eye(3), (len(fixes), 1, 1))
+    aiding = AidingData.of_fixes(truth.stamps_ns[some], fixes, covariances)
+    assert is_in_world_of_fixes(truth, aiding)
+    for turn_deg, shift in ((180.0, 0.0), (0.0, shift_m), (180.0, shift_m)):
+        R = Rotation.from_euler("z", turn_deg, degrees=True).as_matrix()
+        other = Similarity(R, np.array([shift, 0.0, 0.0]), 1.0)
+        assert not is_in_world_of_fixes(other.apply(truth), aiding)

@@ -47,7 +47,7 @@ class Window:
         kept_points: ids (N,) and world positions (N, 3) of the features outside the state that stay
             in the cost.
         last_points: the same of all features that the last step estimated outside the state.
-        calibration: keys of the parameters of the rig that are in the state.
+        calibration: keys of the parameters of rig and position fixes that are in the state.
     """
 
     frame: int

@@ -46,13 +46,15 @@ _MOST_FIXES = 300
 """Fixes that are remembered for the alignment."""
 _TIMINGS = 3
 """Alignments, each at the times that the one before has found."""
-_UNTIMED, _MOST_UNTIMED = 0.5, 40
-"""How far the path comes in the standard deviation of an estimated offset, and how large that of an
-estimated lever arm is, in σ of a fix, at most; with so many fixes they are taken as they are, as on
-a straight road at an even speed nothing tells them."""
+_VAGUE = 0.5
+"""The world is taken once the path moves by less than this many σ of a fix within the standard
+deviation of an estimated time offset, and that of an estimated lever arm is smaller, too."""
+_MOST_VAGUE = 40
+"""With so many fixes it is taken in any case: on a straight road at an even speed nothing tells
+offset and lever arm."""
 _REVISED_M, _REVISED_NS = 0.01, 1_500_000_000
-"""Where lever arm and clock change by so much in one step that they move the body by more than this
-in the world, poses of before are elsewhere than those of after, for so long."""
+"""A step that moves the body by more than this (m) through lever arm and clock; images are not
+compared with the motion for this long (ns) after it."""
 _HISTORY_NS = 5_000_000_000
 """How long odometry and states are kept."""
 
@@ -313,12 +315,12 @@ class Aiding:
         timed = [
             pair for fix in self._fixes if fix.is_timed and (pair := self._path.at(fix, offset_ns))
         ]
-        if not 0 < len(timed) < _MOST_UNTIMED:
+        if not 0 < len(timed) < _MOST_VAGUE:
             return False
         speed = np.mean([np.linalg.norm(pair.velocity) for pair in timed])
         sigma = np.sqrt(np.mean([np.trace(pair.fix.covariance) / 3.0 for pair in timed]))
         arm_sigma = float(np.sqrt(of_arm.max(initial=0.0)))
-        return bool(max(found.offset_sigma_s * speed, arm_sigma) > _UNTIMED * sigma)
+        return bool(max(found.offset_sigma_s * speed, arm_sigma) > _VAGUE * sigma)
 
     def settle(self, found: WorldAlignment) -> list[NavState]:
         """Go on in the world of the fixes; all states so far in that world, the newest last."""

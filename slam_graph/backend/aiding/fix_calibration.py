@@ -39,7 +39,7 @@ class FixVariables:
         keys: of the variables.
         columns: numbers of their components among those of time offset and lever arm, (n,).
         given: (4,) time offset (zero: beyond the given one) and lever arm, as they were given.
-        sigmas: (n,) standard deviations of the variables as they were given.
+        sigmas: (n,) standard deviations of the variables as they were given, s and m.
     """
 
     def __init__(self, config: GnssConfig) -> None:

@@ -62,8 +62,8 @@ GYRO_SCALE_SIGMA, ACCEL_SCALE_SIGMA = 1.25e-4, 1e-3
 """Standard deviations of scale and alignment after calibration, relative; that of the gyroscope per
 rad/s."""
 FEWEST_FEATURES = 20
-"""Corrections by fewer features tell nothing of the IMU: errors of a few tracks that last make them
-large and persistent, and noise that is raised for them follows these tracks all the more."""
+"""Corrections by fewer features tell nothing of the IMU: lasting errors of a few tracks make them
+large and persistent, and larger noise of the IMU gives these tracks even more weight."""
 MAX_FACTOR = 30.0
 """Largest factor on a density."""
 _MAX_SQUARE = 4.0

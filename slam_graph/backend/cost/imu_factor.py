@@ -244,14 +244,14 @@ class Propagation:
         """Adapt the noise of the IMU to the difference of an estimate from its prediction.
 
         Not at a standstill, whose zero velocity is no measurement of images, and not where an IMU
-        is corrected by a few features: one that slides along an edge has a say in all of these.
+        is corrected by a few features: the error of one track then biases all corrections.
 
         Args:
             state: the estimate of the last frame, with its covariance.
-            features: how many the frame has.
+            features: how many the frame has in the camera that sees most of them.
 
         Returns:
-            How the velocity was corrected; None where nothing was learned.
+            How the velocity was corrected; None at a standstill and in the first frame.
         """
         correction = None
         if self._last is not None and self._predicted is not None:

@@ -14,6 +14,8 @@ import numpy as np
 class AdjustmentFigures:
     """Figures of the minimum of one segment or of several together.
 
+    Costs and residuals are those before the noise of the IMU is learned, which moves the states.
+
     Attributes:
         keyframes: number of keyframes.
         features: number of features in the cost.
@@ -25,7 +27,7 @@ class AdjustmentFigures:
         imu_residual: root mean square of the whitened IMU residuals.
         pixel_residual: root mean square of the whitened reprojection residuals.
         pixel_sigma: assumed standard deviation of the observations at the end, pixels.
-        inefficiency: how many of them say as much as one that is independent of the others.
+        inefficiency: variance of slow errors of tracks over that of white noise of this size.
     """
 
     keyframes: int
@@ -71,10 +73,13 @@ def summary_of(
     def total(name: str) -> int:
         return sum(getattr(part, name) for part in solved)
 
-    def rms(name: str, weight: str) -> float:
+    def mean(name: str, weight: str, power: int = 1) -> float:
         weights = [getattr(part, weight) for part in solved]
-        squares = [getattr(part, name) ** 2 for part in solved]
-        return float(np.sqrt(np.average(squares, weights=weights)))
+        values = [getattr(part, name) ** power for part in solved]
+        return float(np.average(values, weights=weights) ** (1.0 / power))
+
+    def rms(name: str, weight: str) -> float:
+        return mean(name, weight, 2)
 
     return FinalBaSummary(
         segments=len(solved),
@@ -88,7 +93,7 @@ def summary_of(
         imu_residual=rms("imu_residual", "keyframes"),
         pixel_residual=rms("pixel_residual", "observations"),
         pixel_sigma=rms("pixel_sigma", "observations"),
-        inefficiency=rms("inefficiency", "observations"),
+        inefficiency=mean("inefficiency", "observations"),
         seconds=time.perf_counter() - began[0],
         cpu_seconds=time.process_time() - began[1],
     )

@@ -3,9 +3,10 @@
 """How far the bundle adjustment of a recording is, as a number of keyframes.
 
 Nobody knows how many steps a minimisation will take. The number of minimisations is known better:
-rounds of fusion, one with outliers, one without, and steps that learn the noise of the IMU. Each
-has the same share, of which every step takes a fixed part of what is left. So the progress never
-stands still, never goes back, and reaches the end only at the end.
+rounds of fusion, one with outliers, one without, one with correlated errors of tracks, and steps
+that learn the noise of the IMU. Each has the same share, of which every step takes a fixed part of
+what is left. So the progress never stands still, never goes back, and reaches the end only at the
+end.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ Report = Callable[[int, int, int], None]
 
 _FUSION = 0.35
 """Part of the time that fusion takes; measured on recordings of 30 s."""
-_PASSES = 3
+_PASSES = 4
 """Minimisations after fusion, and the steps that learn the noise of the IMU."""
 _ROUND, _STEP = 0.5, 0.4
 """Part of what is left that a round of fusion, and a step of a minimisation, is taken to do."""

@@ -46,7 +46,7 @@ class CalibratedFixes:
     start: FloatArray
 
     def whole(self, values: FloatArray) -> FloatArray:
-        """Time offset and lever arm (4,), of the variables (n,)."""
+        """Time offset (s) and lever arm (m), (4,), of the variables (n,)."""
         calibration = self.start.copy()
         calibration[self.variables.columns] = values
         return calibration

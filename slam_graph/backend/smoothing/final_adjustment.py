@@ -69,8 +69,7 @@ class FinalBa:
         aligned: (N, 6, 6) pose covariances of what is left after an alignment in position and yaw
             over all frames, in the body frame, rotation before position; None where positions
             determine no yaw, and of a recording in several segments.
-        noise: factors on the noise of the IMU that the covariances were computed with; of the last
-            segment.
+        noise: learned factors on the noise of the IMU; of the last segment.
         equations: those at the minimum, which others can be joined to; None if they were not wanted
             or are not known, and where the recording was adjusted in several segments.
         fixes: lever arm and clock of the position fixes, where they are variables; of the last
@@ -140,7 +139,9 @@ class FinalBa:
         history = parts[0].history.like()
         for found in parts:
             history.extend(found.history)
-        return FinalBa(history, total_of([found.summary for found in parts]), None)
+        last = parts[-1]
+        summary = total_of([found.summary for found in parts])
+        return FinalBa(history, summary, None, last.noise, fixes=last.fixes)
 
 
 def adjust_recording(
@@ -164,8 +165,8 @@ def adjust_recording(
         backend: noise and triangulation.
         config: settings.
         report: is given the progress after each step.
-        least_noise: smallest factor on the noise of the IMU that is learned for covariances; one if
-            the noise was calibrated.
+        least_noise: smallest factor on the noise of the IMU that is learned; one if the
+            noise was calibrated.
         joint: whether the equations at the minimum are kept, which others can be joined to; not of
             a recording of several segments.
 

@@ -122,9 +122,10 @@ def _calibrated(
     stamps_ns = np.array([fix.stamp_ns for fix in fixes], np.int64)
     before, after = (_poses_at(causal, stamps_ns + sign * _NEAR_NS) for sign in (-1, 1))
     velocities = np.zeros((len(fixes), 3))
-    for row, (fix, first, last) in enumerate(zip(fixes, before, after, strict=True)):
-        if first is not None and last is not None:
-            velocities[row] = (fix.of(last) - fix.of(first)) / (2e-9 * _NEAR_NS)
+    for row, (fix, (then, _), _) in enumerate(free):
+        first, last = before[row] or then, after[row] or then  # one-sided at ends of the path
+        sides = (before[row] is not None) + (after[row] is not None)
+        velocities[row] = (fix.of(last) - fix.of(first)) / (1e-9 * _NEAR_NS * max(sides, 1))
     seen = SeenFixes.of(fixes, [poses for _, poses, _ in free], velocities, found.time_offset_s)
     roots = np.linalg.inv(np.linalg.cholesky(np.array([fix.covariance for fix in fixes])))
     keyframes = np.array([k for _, _, k in free], np.int64)

@@ -15,7 +15,7 @@ import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import B, V, X
 
-from slam_graph.arrays import FloatArray
+from slam_graph.arrays import BoolArray, FloatArray
 from slam_graph.backend.cost.feature_tracks import Observations
 from slam_graph.backend.cost.reprojection import Geometry, RigProjection
 from slam_graph.backend.cost.robust_loss import RobustLoss
@@ -60,7 +60,7 @@ class Estimates:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Step:
-    """Increments of keyframe states (K, 15), features (J, 3) and what is shared by fixes (n,)."""
+    """Increments of keyframe states (K, 15), features (J, 3), clock (s) and lever arm (m) (n,)."""
 
     states: FloatArray
     points: FloatArray
@@ -76,7 +76,7 @@ class ReprojectionCost:
         sigmas_px: (N,) standard deviations of the observations.
         projection: of the rig, with the motions of the keyframes for rolling shutters.
         loss: of the length of a whitened residual.
-        inefficiency: how many observations say as much as one that is independent of the others
+        inefficiency: (N,) or one for all, the information of the observations is divided by it
             (`track_correlation.py`).
     """
 
@@ -84,7 +84,7 @@ class ReprojectionCost:
     sigmas_px: FloatArray
     projection: RigProjection
     loss: RobustLoss
-    inefficiency: float = 1.0
+    inefficiency: FloatArray | float = 1.0
 
     def at(self, estimates: Estimates) -> Geometry:
         """Poses and features."""
@@ -97,7 +97,7 @@ class ReprojectionCost:
         behind = np.flatnonzero(depths <= 0.0)
         focal = np.array([camera.fx for camera in self.projection.cameras])
         lengths[behind] = np.sqrt(8.0) * focal[self.obs.camera[behind]]
-        return float(np.sum(self.loss.value(lengths / self.sigmas_px))) / self.inefficiency
+        return float(np.sum(self.loss.value(lengths / self.sigmas_px) / self.inefficiency))
 
     def linearized(self, estimates: Estimates) -> LinearReprojection:
         """Whitened residuals and Jacobians, weighted by the loss."""
@@ -129,6 +129,11 @@ class LinearReprojection:
     r: FloatArray
     by_pose: FloatArray
     by_point: FloatArray
+
+    def rows(self, keep: BoolArray) -> LinearReprojection:
+        """Some of the observations, of the same features."""
+        parts = self.r[keep], self.by_pose[keep], self.by_point[keep]
+        return LinearReprojection(self.obs.rows(keep), *parts)
 
     def gradient(self, keyframes: int) -> tuple[FloatArray, FloatArray]:
         """Jᵀ r by the poses (K, 6) and the features (J, 3)."""

@@ -143,7 +143,7 @@ class AdjustedSegment:
         states: of every frame; covariances, if known, relative to position and yaw of the anchor.
         figures: of the minimum.
         aligned: (N, 6, 6) pose covariances after an alignment in position and yaw, or None.
-        noise: factors on the noise of the IMU that the covariances were computed with.
+        noise: factors on the noise of the IMU of this minimum.
         equations: those at the minimum, if they are wanted and there are covariances.
         fixes: lever arm and clock of position fixes, where they are variables.
     """
@@ -211,8 +211,8 @@ class BundleAdjustment:
         if self._config.learn_pixel_sigma and self._learn_inefficiency():
             points = self._minimum.estimates.points
             cost, imu_cost = self._minimize(obs, points, variances, self._config.tolerance)
-        images = self._minimum.cost.images
-        squares = images.value(self._minimum.estimates) * images.inefficiency
+        images = replace(self._minimum.cost.images, inefficiency=1.0)
+        squares = images.value(self._minimum.estimates)
         figures = AdjustmentFigures(
             keyframes=len(keyframes),
             features=len(obs.ids),
@@ -223,7 +223,7 @@ class BundleAdjustment:
             imu_residual=float(np.sqrt(2.0 * imu_cost / (15 * max(len(keyframes) - 1, 1)))),
             pixel_residual=float(np.sqrt(squares / max(len(obs), 1))),
             pixel_sigma=self._sigma_px,
-            inefficiency=images.inefficiency,
+            inefficiency=self._inefficiency,
         )
         states, aligned, equations = self._states(self._segment.stamps_ns), None, None
         try:
@@ -234,6 +234,7 @@ class BundleAdjustment:
         except (RuntimeError, np.linalg.LinAlgError) as error:
             logger.info("no covariances: %s", " ".join(str(error).split())[:200])
             equations = None
+        figures = replace(figures, iterations=self.iterations)
         kept = equations if self._task.joint else None
         fixes = None if equations is None else equations.minimum.fixes
         return AdjustedSegment(states, figures, aligned, self.imu_noise, kept, fixes)
@@ -285,10 +286,14 @@ class BundleAdjustment:
         self._sigma_px = float(np.clip(sigma_px, _MIN_SIGMA_RATIO * configured_px, configured_px))
 
     def _learn_inefficiency(self) -> bool:
-        """Estimate how far errors of tracks are correlated; whether images count less for it."""
+        """Estimate how far errors of tracks are correlated; whether images count less for it.
+
+        Depths are no part of it: their noise is known.
+        """
         found = self._minimum
         linear = found.cost.images.linearized(found.estimates)
-        self._inefficiency = statistical_inefficiency(linear)
+        tracked = ~is_of_depth(linear.obs, self._task.rig)
+        self._inefficiency = statistical_inefficiency(linear.rows(tracked))
         return self._inefficiency > 1.0
 
     def _without_outliers(
@@ -346,7 +351,7 @@ class BundleAdjustment:
                 self._sigmas_px(obs) * np.sqrt(variances),
                 self._projection,
                 RobustLoss(self._config.robust_loss, self._config.robust_width),
-                self._inefficiency,
+                np.where(is_of_depth(obs, self._task.rig), 1.0, self._inefficiency),
             ),
             len(self._segment.keyframes),
             self._segment.aiding.calibrated,
@@ -380,7 +385,8 @@ class BundleAdjustment:
         poses = stacked_poses(self._given, obs.frames)
         points, good = triangulated(obs, poses, self._projection, self._backend)
         points[~good] = self._minimum.estimates.points[~good]
-        return self._minimum.cost.value(Estimates(self._given, points, self._shared))
+        given = Estimates(self._given, points, self._segment.aiding.shared())
+        return self._minimum.cost.value(given)
 
     def _equations(self) -> PoseEquations:
         """The equations at the minimum.

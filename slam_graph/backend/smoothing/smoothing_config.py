@@ -44,8 +44,9 @@ class FinalBaConfig(Settings):
     fuse_features: bool = expert(True)
     """Whether tracks that are found to be of the same point become one feature."""
     learn_pixel_sigma: bool = expert(True)
-    """Whether the noise of the tracks is estimated, with noise.pixel_sigma as an upper bound, and
-    how far it is correlated from keyframe to keyframe. Correlated observations count for less."""
+    """Whether the noise of the tracks is estimated, with noise.pixel_sigma as an upper bound of
+    single observations, and how far it is correlated from keyframe to keyframe, for which they
+    count less."""
     learn_imu_noise: bool = expert(True)
     """Whether the noise of the IMU that residuals show is used; the calibrated one is a lower
     bound."""

@@ -11,7 +11,8 @@ too small. The model is an autoregressive process of first order in each camera,
 over keyframes s and t. The mean of many such errors has the variance of white noise with
 σ² (1 + ρ) / (1 - ρ). By this factor, the statistical inefficiency, the information of the images is
 too large (Bartlett 1946, effective sample size). It is exact for errors that are slow beside
-1 / (1 - ρ) keyframes, such as drift, and too large for those from one keyframe to the next.
+1 / (1 - ρ) keyframes, such as drift, and too large for those from one keyframe to the next. White
+noise beside such errors hides a part of them; tracks in images show none.
 
 At the minimum, what can be seen of ε are the residuals e = P ε, P = I - Q Qᵀ the projection off the
 three directions of the point of the track, which takes most of what is slow. So ρ and σ are those
@@ -32,15 +33,19 @@ _LEAST_OBSERVATIONS, _MOST_OBSERVATIONS = 8, 64
 """Shorter tracks tell nothing, as their points follow their errors. Of longer ones the first
 observations are taken, which is enough, as the time grows with the cube of their number."""
 _CORRELATIONS = np.concatenate([[0.0], np.arange(0.1, 0.96, 0.05)])
-"""Values of ρ between which expected sums are interpolated."""
+"""Values of ρ between which expected sums are interpolated. Errors that are still slower hardly
+change within a track, and its point follows them."""
 
 
 def statistical_inefficiency(linear: LinearReprojection) -> float:
-    """How many observations say as much as one that is independent of the others; at least one.
+    """Variance of slow errors of tracks over that of white noise, σ² (1 + ρ) / (1 - ρ).
 
     Args:
-        linear: the reprojection errors at the minimum, whitened with what is taken for their
-            standard deviation.
+        linear: the reprojection errors at the minimum, whitened with the standard deviation of
+            white noise, which σ is relative to.
+
+    Returns:
+        The statistical inefficiency, at least one.
     """
     obs, starts = linear.obs, linear.obs.starts
     counts = np.diff(starts)
