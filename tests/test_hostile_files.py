@@ -24,6 +24,7 @@ from slam_graph.datasets import open_dataset
 from slam_graph.datasets.calibration.calibration_yaml import read_yaml
 from slam_graph.datasets.calibration.kalibr_calibration import read_kalibr, write_kalibr
 from slam_graph.datasets.formats import track_recording as layout
+from slam_graph.datasets.formats import video
 from slam_graph.datasets.groundtruth import read_groundtruth
 from slam_graph.datasets.rosbag import bounded_unpacking
 from slam_graph.diagnostics import Diagnostics
@@ -353,29 +354,41 @@ def test_a_compressed_problem_unpacks_within_a_bound(tmp_path: Path) -> None:
         read_bal(path)
 
 
-def test_a_video_that_claims_too_many_frames_is_counted(tmp_path: Path) -> None:
+@pytest.mark.parametrize(("claimed", "most"), [(900_000_000, None), (1000, 100)])
+def test_a_video_that_claims_too_many_frames_is_counted(
+    claimed: int, most: int | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """More than it has bytes, or more than any video has."""
     path = write_video(tmp_path, "flight.avi", "MJPG")
+    if most is not None:
+        assert path.stat().st_size > claimed
+        monkeypatch.setattr(video, "_MOST_FRAMES", most)
     write_times(path.with_suffix(".csv"))
     content = bytearray(path.read_bytes())
     for header, field in ((b"avih", 16), (b"strh", 32)):
         at = content.find(header) + 8 + field
-        content[at : at + 4] = (900_000_000).to_bytes(4, "little")
+        content[at : at + 4] = claimed.to_bytes(4, "little")
     path.write_bytes(content)
     assert open_dataset(path).info().frames == 8
 
 
-def test_a_sigma_with_two_points_is_read_as_far_as_it_is_a_number(tmp_path: Path) -> None:
+def test_a_sigma_that_is_no_number_is_refused(tmp_path: Path) -> None:
     folder = write_openvins(tmp_path / "flight", frames=4, features=5)
     start = folder / "init_state.csv"
-    whole = open_dataset(folder).initial_state()
-    assert whole is not None
     text = start.read_text()
     assert "bg 0.03," in text
-    for damaged in ("0.03.", "0.03.1", "0.03.e2"):
+    for written in (".03", "3e-2", "+0.03", "0.03."):
+        start.write_text(text.replace("bg 0.03,", f"bg {written},"))
+        state = open_dataset(folder).initial_state()
+        assert state is not None
+        assert state.covariance is not None
+        np.testing.assert_allclose(np.diag(state.covariance)[12:], 0.03**2)
+    for damaged in ("1.2.3", "0.03.e2", "0.0x3", "-0.03", "0", "1e200", "1e-200"):
         start.write_text(text.replace("bg 0.03,", f"bg {damaged},"))
-        again = open_dataset(folder).initial_state()
-        assert again is not None
-        np.testing.assert_array_equal(again.covariance, whole.covariance)
+        with pytest.raises(
+            DataError, match=r"init_state\.csv: prior sigma of bg: .* is no positive"
+        ):
+            open_dataset(folder).initial_state()
 
 
 # --- names of other files -------------------------------------------------------------------------

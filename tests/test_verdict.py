@@ -19,7 +19,7 @@ from slam_graph.datasets.faults.injection import inject
 from slam_graph.datasets.memory_sequence import dataset_from_arrays
 from slam_graph.datasets.sequence import RecordedSequence
 from slam_graph.diagnosis import Diagnosis, run_evidence
-from slam_graph.pipeline import recovery, verdict
+from slam_graph.pipeline import clock_watch, recovery, verdict
 from slam_graph.pipeline.run_recording import run
 from slam_graph.sensors.measurements import FeatureFrame
 from slam_graph.sensors.rig import Rig, RigCamera
@@ -133,6 +133,17 @@ def test_a_right_one_is_not_even_if_it_is_doubted(
 
 def test_a_fault_that_nothing_in_the_run_shows_is_suspect() -> None:
     result = run(flown(lambda rig: with_longer_lenses(rig, 1.1)), overrides=CAUSAL)
+    assert result.status == "suspect", result.message
+    assert "calibrated focal length is 1." in result.message
+
+
+def test_a_failure_of_the_clock_watch_costs_no_diagnosis(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fails(_: object) -> Diagnosis:
+        raise ValueError("no clocks")
+
+    monkeypatch.setattr(clock_watch.ClockWatch, "finish", fails)
+    result = run(flown(with_longer_lenses, duration_s=12.0), overrides=CAUSAL)
+    assert result.warnings["diagnosis_failed"] == 1
     assert result.status == "suspect", result.message
     assert "calibrated focal length is 1." in result.message
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 
@@ -18,10 +19,17 @@ from slam_graph.arrays import FloatArray
 from slam_graph.diagnosis.camera_and_gyroscope import BAD_OFFSET_S, CLEARLY, FEWEST_PAIRS, SIGMAS
 from slam_graph.diagnosis.finding import Finding
 from slam_graph.diagnosis.frame_pairs import frame_pairs
-from slam_graph.diagnosis.gathering import PART_S, Part, around, uninterrupted
+from slam_graph.diagnosis.gathering import (
+    PART_S,
+    Part,
+    around,
+    finite,
+    long_enough,
+    uninterrupted,
+)
 from slam_graph.diagnosis.gyroscope import Gyroscope
 from slam_graph.diagnosis.rotation_fit import Kinematics, RotationFit, RotationProblem
-from slam_graph.sensors import FeatureFrame, ImuData, Rig
+from slam_graph.sensors import FeatureFrame, ImuData, Rig, RigCamera
 
 _LEAST_RATE = 0.05
 """Standard deviation of the angular rate, rad/s, below which a window does not show an offset to
@@ -30,8 +38,6 @@ _LEAST_SIGMA_S = 1e-3
 """No offset of a window is known better than this."""
 _PRECISION = 0.1
 """Steps end where they are smaller than 3 ms and 5 mrad/s; where the offset differs they go on."""
-_FEWEST_FRAMES, _FEWEST_SAMPLES = 11, 50
-"""Of a piece of a window without gaps."""
 _BIASES = ("bx", "by", "bz")
 
 
@@ -41,12 +47,13 @@ class ClockWindow:
 
     Attributes:
         begin_ns, end_ns: times of its first and its last frame.
-        offset_s: t_imu - t_camera at the middle row of the image.
+        offset_s: t_imu - t_camera, as in the calibration (`time_offset_s`).
         sigma_s: its standard deviation.
         bias: (3,) of the gyroscope, rad/s.
         noise_px: robust standard deviation of the epipolar distances.
         differs: whether most of its features also fit this offset better than that of the windows
-            before, where the two are far apart.
+            before, where the two are far apart. Those that differ themselves do not count: the
+            offset may have changed within them.
     """
 
     begin_ns: int
@@ -56,6 +63,11 @@ class ClockWindow:
     bias: FloatArray
     noise_px: float
     differs: bool = False
+
+    @property
+    def middle_ns(self) -> int:
+        """Time of its middle."""
+        return (self.begin_ns + self.end_ns) // 2
 
     @staticmethod
     def of(
@@ -68,53 +80,55 @@ class ClockWindow:
 
         Args:
             rig: the calibration; its first camera is looked at.
-            frames: of the window, 4 s of them or more.
+            frames: of the window.
             imu: samples over them.
             before: the windows before this one.
         """
         if not frames:
             return None
         begin_ns, end_ns = frames[0].stamp_ns, frames[-1].stamp_ns
-        finite = np.isfinite(imu.gyro).all(axis=1)
-        imu = ImuData(imu.stamps_ns[finite], imu.gyro[finite], imu.accel[finite])
-        imu = around(imu, begin_ns, end_ns)
+        imu = around(finite(imu), begin_ns, end_ns)
         if len(imu) < 2 or float(np.max(np.std(imu.gyro, axis=0))) < _LEAST_RATE:
             return None
-        pieces = uninterrupted(Part(list(frames), imu))
-        parts = [
-            p for p in pieces if len(p.frames) >= _FEWEST_FRAMES and len(p.imu) >= _FEWEST_SAMPLES
-        ]
+        parts = long_enough(uninterrupted(Part(list(frames), imu)))
         gyroscopes, camera = [Gyroscope(part.imu) for part in parts], rig.cameras[0]
         pairs = frame_pairs(parts, gyroscopes, camera, turns=False)
         if len(pairs) < FEWEST_PAIRS:
             return None
-        known = _mean(before)
+        known = _mean([window for window in before if not window.differs])
         R, offset_s = camera.body_T_camera.rotation().matrix(), camera.clock_offset_s
         bias = before[-1].bias if before else np.zeros(3)
         if known is not None:
-            offset_s = known.offset_s
+            offset_s = known.offset_s + camera.middle_s
         start = Kinematics(offset_s, 1.0, camera.readout_s, R, bias)
         problem = RotationProblem(pairs, gyroscopes, camera)
         try:
             fit = problem.solve(start, ("offset", *_BIASES), _PRECISION)
             if known is None or abs(fit.values.offset_s - offset_s) < BAD_OFFSET_S:
-                return ClockWindow._fitted(begin_ns, end_ns, fit)
+                return ClockWindow._fitted(begin_ns, end_ns, fit, camera)
             fit = problem.solve(fit.values, ("offset", *_BIASES))
             held = problem.solve(start, _BIASES)
         except np.linalg.LinAlgError:
             return None
         differs = fit.noise_px * CLEARLY < held.noise_px
-        return replace(ClockWindow._fitted(begin_ns, end_ns, fit), differs=differs)
+        return replace(ClockWindow._fitted(begin_ns, end_ns, fit, camera), differs=differs)
 
     @staticmethod
-    def _fitted(begin_ns: int, end_ns: int, fit: RotationFit) -> ClockWindow:
+    def _fitted(begin_ns: int, end_ns: int, fit: RotationFit, camera: RigCamera) -> ClockWindow:
         """What a fit says of a window."""
         at, sigma_s = fit.values, max(float(fit.sigmas[0]), _LEAST_SIGMA_S)
-        return ClockWindow(begin_ns, end_ns, at.offset_s, sigma_s, at.bias, fit.noise_px)
+        offset_s = at.offset_s - camera.middle_s
+        return ClockWindow(begin_ns, end_ns, offset_s, sigma_s, at.bias, fit.noise_px)
 
 
 class ClockWindows:
-    """The windows of a recording, in their order."""
+    """The windows of a recording, in their order.
+
+    Attributes:
+        LENGTH_NS: of a window.
+    """
+
+    LENGTH_NS: ClassVar[int] = round(PART_S * 1e9)
 
     def __init__(self) -> None:
         self._windows: list[ClockWindow] = []
@@ -131,7 +145,7 @@ class ClockWindows:
             parts: with frames.
         """
         found = ClockWindows()
-        length_ns = round(PART_S * 1e9)
+        length_ns = ClockWindows.LENGTH_NS
         for part in parts:
             stamps = np.array([frame.stamp_ns for frame in part.frames], np.int64)
             begin_ns = int(stamps[0])
@@ -147,43 +161,58 @@ class ClockWindows:
 
         Args:
             rig: the calibration; its first camera is looked at.
-            frames: of the window, 4 s of them or more.
+            frames: of the window.
             imu: samples over them.
         """
         window = ClockWindow.of(rig, frames, imu, self._windows)
         if window is not None:
             self._windows.append(window)
 
-    def change(self, lost: Sequence[tuple[int, int]], first_ns: int) -> Finding | None:
+    def forget_after(self, stamp_ns: int) -> None:
+        """Forget the windows that end after a time, as the estimate was lost then.
+
+        Those that are added later are compared with the others only.
+        """
+        self._windows = [window for window in self._windows if window.end_ns <= stamp_ns]
+
+    def change(self, first_ns: int) -> Finding | None:
         """The first change of the time offset that is beyond doubt.
 
         Args:
-            lost: times in which an estimate was lost, ns: windows that reach into them do not
-                count.
             first_ns: time of the first frame of the recording.
         """
-        good = [
-            w
-            for w in self._windows
-            if not any(begin < w.end_ns and w.begin_ns < end for begin, end in lost)
-        ]
-        for k, window in enumerate(good):
-            before = _mean(good[:k])
-            if before is not None and window.differs and _are_apart(before, window):
-                return _found(before, window, first_ns)
+        alike: list[ClockWindow] = []
+        for window in self._windows:
+            before = _mean(alike)
+            if not window.differs:
+                alike.append(window)
+            elif before is not None and _are_apart(before, window):
+                middles_ns = alike[-1].middle_ns, window.middle_ns
+                between_s = [(at_ns - first_ns) * 1e-9 for at_ns in middles_ns]
+                return _found(before, window, between_s)
         return None
 
 
-def _found(before: ClockWindow, after: ClockWindow, first_ns: int) -> Finding:
-    """The finding of a change."""
+def _found(before: ClockWindow, after: ClockWindow, between_s: list[float]) -> Finding:
+    """The finding of a change.
+
+    A window may have a part of the other offset, so the change is somewhere between the middle of
+    the last window that is like those before and that of the first one that differs beyond doubt.
+    """
     change_s, sigma_s = _difference(before, after)
-    at_s = (after.begin_ns - first_ns) * 1e-9
     what = (
-        f"the time offset between camera and IMU changes at about t = {at_s:.0f} s, from "
-        f"{1e3 * before.offset_s:.1f} to {1e3 * after.offset_s:.1f} ± {1e3 * sigma_s:.1f} ms"
+        f"the time offset between camera and IMU changes by {1e3 * change_s:.1f} ± "
+        f"{1e3 * sigma_s:.1f} ms between t = {between_s[0]:.0f} and {between_s[1]:.0f} s, from "
+        f"{1e3 * before.offset_s:.1f} to {1e3 * after.offset_s:.1f} ms"
     )
     fix = "look for late or jumping stamps of the IMU or the camera; run the parts apart"
-    values = {"at_s": at_s, "before_s": before.offset_s, "after_s": after.offset_s}
+    values = {
+        "between_s": between_s,
+        "change_s": change_s,
+        "sigma_s": sigma_s,
+        "before_s": before.offset_s,
+        "after_s": after.offset_s,
+    }
     sigmas = abs(change_s) / sigma_s
     return Finding.measured("time_offset_change", "error", what, fix, sigmas, values)
 

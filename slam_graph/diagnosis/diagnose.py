@@ -7,15 +7,21 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 
-import numpy as np
-
 from slam_graph.arrays import FloatArray
 from slam_graph.datasets import RecordedSequence
 from slam_graph.diagnosis.camera_and_gyroscope import compare, refine
 from slam_graph.diagnosis.clock_windows import ClockWindows
 from slam_graph.diagnosis.finding import Finding, in_order
 from slam_graph.diagnosis.frame_checks import check_images, check_stamps, check_tracks
-from slam_graph.diagnosis.gathering import Material, Part, around, gather, uninterrupted
+from slam_graph.diagnosis.gathering import (
+    Material,
+    Part,
+    around,
+    finite,
+    gather,
+    long_enough,
+    uninterrupted,
+)
 from slam_graph.diagnosis.imu_checks import check_sampling, check_units
 from slam_graph.diagnosis.motion_checks import check_motion
 from slam_graph.diagnosis.run_evidence import Evidence
@@ -42,8 +48,10 @@ SETUP_KINDS = (
 """Findings about what a run was given: calibration, units and clocks."""
 _SURE_WARNINGS = ("baseline", "stereo_geometry")
 """Those that count where they are warnings too; all others where they are errors."""
-_FEWEST_SAMPLES, _FEWEST_FRAMES = 50, 10
-"""Samples and frames that a comparison needs at least."""
+_SINGLE_OFFSET = "time_offset"
+"""Says less than a change of it does."""
+_NOT_PLAINER = SETUP_KINDS[SETUP_KINDS.index(_SINGLE_OFFSET) :]
+"""What a change of the time offset comes before."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,10 +62,9 @@ class Diagnosis:
         findings: errors first, and among equals the plainest cause first.
     """
 
-    class Clocks(ClockWindows):
-        """The time offset in one window of a recording after another."""
-
     findings: list[Finding]
+
+    Clocks = ClockWindows
 
     @staticmethod
     def of(recording: RecordedSequence) -> Diagnosis:
@@ -73,9 +80,33 @@ class Diagnosis:
         found = _judged(material)
         if material.rig.has_imu and material.rig.cameras[0].rotation_known:
             windows = ClockWindows.of(material.rig, material.parts)
-            change = windows.change((), recording.info().start_ns)
-            if change is not None:  # one offset for the whole recording says less
-                found = [change, *(f for f in found if f.kind != "time_offset")]
+            clocks = Diagnosis.of_clocks(windows, recording.info().start_ns)
+            return Diagnosis(found).with_clocks(clocks)
+        return Diagnosis(in_order(found))
+
+    @staticmethod
+    def of_clocks(windows: ClockWindows, first_ns: int) -> Diagnosis:
+        """The first change of the time offset that is beyond doubt, if there is one.
+
+        Args:
+            windows: of a recording.
+            first_ns: time of its first frame.
+        """
+        change = windows.change(first_ns)
+        return Diagnosis([] if change is None else [change])
+
+    def with_clocks(self, clocks: Diagnosis) -> Diagnosis:
+        """With a change of the time offset; one offset for the whole recording says less then.
+
+        Args:
+            clocks: of the same recording, see `of_clocks`.
+        """
+        found = self.findings
+        if clocks.findings:
+            kinds = [finding.kind for finding in found]
+            at = next((k for k, kind in enumerate(kinds) if kind in _NOT_PLAINER), len(found))
+            found = [*found[:at], *clocks.findings, *found[at:]]
+            found = [finding for finding in found if finding.kind != _SINGLE_OFFSET]
         return Diagnosis(in_order(found))
 
     @staticmethod
@@ -235,22 +266,13 @@ def _remembered(
 
 def _enough(material: Material, factor: float) -> list[Part]:
     """Pieces without interruption that can be compared, with forces in m/s²."""
-    parts = [_in_si(part, factor) for part in material.parts]
+    parts = [Part(part.frames, finite(part.imu, factor)) for part in material.parts]
 
     def enough(lost: Sequence[tuple[int, int]]) -> list[Part]:
         pieces = [_covered(piece) for part in parts for piece in uninterrupted(part, lost)]
-        return [
-            p for p in pieces if len(p.imu) >= _FEWEST_SAMPLES and len(p.frames) > _FEWEST_FRAMES
-        ]
+        return long_enough(pieces)
 
     return enough(material.lost) or enough(())
-
-
-def _in_si(part: Part, factor: float) -> Part:
-    """A part with forces in m/s², and the samples that are finite."""
-    imu = part.imu
-    good = np.isfinite(imu.gyro).all(axis=1) & np.isfinite(imu.accel).all(axis=1)
-    return Part(part.frames, ImuData(imu.stamps_ns[good], imu.gyro[good], factor * imu.accel[good]))
 
 
 def _covered(part: Part) -> Part:

@@ -8,7 +8,7 @@ platform turns most, because rotation shows clocks, mounting and focal length.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -34,6 +34,9 @@ _PAUSE_NS, _GAP_NS = 500_000_000, 200_000_000
 """Nothing is compared across longer times without frames, and without samples."""
 _PAUSE_FRAMES = 3.0
 """With a slow camera the first of them is so many times that from frame to frame."""
+
+_FEWEST_SAMPLES, _FEWEST_FRAMES = 50, 11
+"""Samples and frames that a comparison needs at least."""
 
 _MATCHED_FRAMES = 3
 """The second camera is looked at in every third frame."""
@@ -140,6 +143,17 @@ def uninterrupted(part: Part, lost: Sequence[tuple[int, int]] = ()) -> list[Part
         imu = around(imu, int(stamps[rows[0]]), int(stamps[rows[-1]]))
         pieces.append(Part([frames[row] for row in rows], imu))
     return pieces
+
+
+def finite(imu: ImuData, factor: float = 1.0) -> ImuData:
+    """The samples that are finite, with a factor on the specific forces."""
+    good = np.isfinite(imu.gyro).all(axis=1) & np.isfinite(imu.accel).all(axis=1)
+    return ImuData(imu.stamps_ns[good], imu.gyro[good], factor * imu.accel[good])
+
+
+def long_enough(pieces: Iterable[Part]) -> list[Part]:
+    """The pieces with enough frames and samples to be compared."""
+    return [p for p in pieces if len(p.imu) >= _FEWEST_SAMPLES and len(p.frames) >= _FEWEST_FRAMES]
 
 
 def chosen_parts(start_ns: int, end_ns: int, imu: ImuData) -> list[tuple[int, int]]:

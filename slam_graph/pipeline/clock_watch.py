@@ -14,10 +14,8 @@ from slam_graph.sensors import FeatureFrame, ImuData
 if TYPE_CHECKING:
     from slam_graph.diagnosis import Diagnosis
 
-_WINDOW_NS = 8_000_000_000
-"""Length of a window; one at the end of a run is used from half of that on."""
-_SPACING_NS = 90_000_000
-"""Time between frames that are looked at."""
+SPACING_NS = 90_000_000
+"""Time between frames of a run that are diagnosed."""
 
 
 class ClockWatch:
@@ -32,45 +30,63 @@ class ClockWatch:
     """
 
     def __init__(self, result: RunResult, objects: NoObjects, diagnostics: Diagnostics) -> None:
+        from slam_graph.diagnosis import Diagnosis  # it takes a moment to import
+
         self._result, self._objects, self._diagnostics = result, objects, diagnostics
         self._frames: list[FeatureFrame] = []
         self._samples: list[ImuData] = []
-        self._windows: Diagnosis.Clocks | None = None
+        self._windows = Diagnosis.Clocks()
         self._losses = 0
 
     def add(self, frame: EstimatedFrame) -> None:
         """Take the next frame."""
-        features, lost = frame.features, len(self._result.segments.losses)
-        if lost > self._losses:
-            self._losses, self._frames, self._samples = lost, [], []
-        if self._frames and features.stamp_ns - self._frames[0].stamp_ns >= _WINDOW_NS:
+        features = frame.features
+        self._forget_lost()
+        if self._frames and self._lasts_ns(features.stamp_ns) >= self._windows.LENGTH_NS:
             self._close()
+        if not self._frames:
+            self._samples = self._samples[-1:]
         self._samples.append(frame.imu)
-        if not self._frames or features.stamp_ns - self._frames[-1].stamp_ns >= _SPACING_NS:
+        if not features.cameras or not len(features.cameras[0]):
+            return
+        if not self._frames or features.stamp_ns - self._frames[-1].stamp_ns >= SPACING_NS:
             self._frames.append(FeatureFrame(features.stamp_ns, features.cameras[:1]))
 
     def finish(self) -> Diagnosis:
-        """A finding of the first change that is beyond doubt, if there is one."""
-        from slam_graph.diagnosis import Diagnosis  # it takes a moment to import
+        """A finding of the first change that is beyond doubt, if there is one.
 
-        frames, result = self._frames, self._result
-        if frames and 2 * (frames[-1].stamp_ns - frames[0].stamp_ns) >= _WINDOW_NS:
+        The last window may be half as long as the others.
+        """
+        from slam_graph.diagnosis import Diagnosis
+
+        self._forget_lost()
+        frames = self._frames
+        if frames and 2 * self._lasts_ns(frames[-1].stamp_ns) >= self._windows.LENGTH_NS:
             self._close()
-        if self._windows is None:
-            return Diagnosis([])
-        change = self._windows.change(result.segments.losses, result.input.start_ns)
-        return Diagnosis([] if change is None else [change])
+        return Diagnosis.of_clocks(self._windows, self._result.input.start_ns)
+
+    def _lasts_ns(self, stamp_ns: int) -> int:
+        """How long the present window lasts at a time."""
+        return stamp_ns - self._frames[0].stamp_ns
+
+    def _forget_lost(self) -> None:
+        """Begin anew after a loss of the estimate, and forget the windows that reach into it.
+
+        The platform may have been put somewhere else, and what comes is compared with what was
+        before.
+        """
+        losses = self._result.segments.losses
+        for begin_ns, _ in losses[self._losses :]:
+            self._frames, self._samples = [], []
+            self._windows.forget_after(begin_ns)
+        self._losses = len(losses)
 
     def _close(self) -> None:
         """Estimate the offset of the present window, and begin another one."""
-        from slam_graph.diagnosis import Diagnosis
-
-        imu, rig = ImuData.concatenate(self._samples), self._result.causal_rig
-        frames = [frame.usable(1)[0].without(self._objects.moved) for frame in self._frames]
-        self._frames, self._samples = [], self._samples[-1:]
+        kept, samples, rig = self._frames, self._samples, self._result.causal_rig
+        self._frames, self._samples = [], samples[-1:]
         if not rig.cameras[0].rotation_known:
             return
-        if self._windows is None:
-            self._windows = Diagnosis.Clocks()
         with warn_on_failure(self._diagnostics, "diagnosis_failed", "a window is left out"):
-            self._windows.add(rig, frames, imu)
+            frames = [frame.usable(1)[0].without(self._objects.moved) for frame in kept]
+            self._windows.add(rig, frames, ImuData.concatenate(samples))

@@ -179,6 +179,13 @@ class Estimation:
             self._recovery.append(states)
         else:
             self._recovery.supersede(states)
+        self._note_fixes()
+
+    def _note_fixes(self) -> None:
+        """Note lever arm and clock of the position fixes as they are known now."""
+        estimator, result = self.estimator, self._result
+        result.fix_calibration = estimator.fix_calibration or result.fix_calibration
+        result.fix_offset_s = estimator.aiding.offset_s
 
     def _start_from_known_state(self, stamp_ns: int) -> None:
         state = self._start.at(stamp_ns)
@@ -214,8 +221,7 @@ class Estimation:
             result.georeferenced = estimator.aiding.aligned
             if len(result.segments) < 2:
                 result.start_was_given &= estimator.start_is_given
-        result.fix_calibration = estimator.fix_calibration or result.fix_calibration
-        result.fix_offset_s = estimator.aiding.offset_s
+        self._note_fixes()
         if state is not None:
             check_sane(state, result.config)
             self._recovery.agreement.check(stamp_ns, estimator.report.innovations)

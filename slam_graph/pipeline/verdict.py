@@ -1,11 +1,12 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""The verdict on a run: what its first seconds say about calibration, units and clocks.
+"""The verdict on a run: what its recording says about calibration, units and clocks.
 
 A run with a wrong calibration may come to its end, with errors that nothing in it shows. So every
 run is followed by a quick look at the tracks after its start, and one that failed, was not smooth,
 or contradicts that look, by a diagnosis. If that finds a fault in what the run was given, the run
 is `suspect`, whatever it has estimated. A run that does not start is looked at while it waits.
+The time offset between camera and IMU is watched over the whole run, as it may change later on.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ import numpy as np
 
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import DataError, EstimationError
-from slam_graph.pipeline.clock_watch import ClockWatch
+from slam_graph.pipeline.clock_watch import SPACING_NS, ClockWatch
 from slam_graph.pipeline.stage import COMPLETED, EstimatedFrame, NoObjects, Stage, warn_on_failure
 from slam_graph.results import RunResult
 from slam_graph.sensors import CameraFrame, FeatureFrame, ImuData, Rig
@@ -29,8 +30,6 @@ if TYPE_CHECKING:
 
 _KEPT_NS = 24_000_000_000
 """So much of the recording is looked at: what came after the start, as far as it goes."""
-_SPACING_NS = 90_000_000
-"""Time between frames that are kept."""
 _PAIRS, _PAIRS_APART_NS = 4, 1_500_000_000
 """Images of two cameras that are kept, and the time between them."""
 _FIRST_LOOK_NS = 5_000_000_000
@@ -92,7 +91,7 @@ class _Memory:
         """Keep a frame, if the last one was long enough ago, and forget old ones."""
         stamp_ns, frames = frame.features.stamp_ns, self._frames
         self._since.append(frame.imu)
-        if frames and stamp_ns - frames[-1][0].stamp_ns < _SPACING_NS:
+        if frames and stamp_ns - frames[-1][0].stamp_ns < SPACING_NS:
             return
         frames.append((frame.features, ImuData.concatenate(self._since)))
         if frame.objects is not None and frame.state is None:
@@ -124,8 +123,9 @@ class Verdict(Stage):
     ) -> None:
         self._result, self._diagnostics = result, diagnostics
         objects = objects or NoObjects()
-        self._kept = _Memory(len(result.input.rig.cameras) > 1, objects)
-        self._clocks = ClockWatch(result, objects, diagnostics)
+        rig = result.input.rig
+        self._kept = _Memory(len(rig.cameras) > 1, objects)
+        self._clocks = ClockWatch(result, objects, diagnostics) if rig.has_imu else None
         self._estimated = self._at_limit = 0  # frames with a state; noise of the IMU at its limit
         self._started_ns: int | None = None
         self._first_ns: int | None = None
@@ -142,7 +142,7 @@ class Verdict(Stage):
                 wrong.
         """
         stamp_ns = frame.features.stamp_ns
-        if self._result.input.rig.has_imu:
+        if self._clocks is not None:
             self._clocks.add(frame)
         if frame.restarted:
             self._estimated = self._at_limit = 0
@@ -169,10 +169,19 @@ class Verdict(Stage):
         unusual, contradictions = False, list[str]()
         with warn_on_failure(self._diagnostics, "diagnosis_failed", "evidence is left out"):
             unusual, contradictions = self._contradictions()
+        clocks = self._clock_change()
         with warn_on_failure(self._diagnostics, "diagnosis_failed", "the cause is not looked for"):
-            clocks = self._clocks.finish()
-            if failed or unusual or clocks.findings or self._is_doubtful():
+            if failed or unusual or clocks is not None or self._is_doubtful():
                 self._judge(failed, contradictions, clocks)
+
+    def _clock_change(self) -> Diagnosis | None:
+        """A change of the time offset; None if there is none, or that cannot be said."""
+        if self._clocks is None:
+            return None
+        with warn_on_failure(self._diagnostics, "diagnosis_failed", "clocks are not compared"):
+            found = self._clocks.finish()
+            return found if found.findings else None
+        return None
 
     def _contradictions(self) -> tuple[bool, list[str]]:
         """Whether the run by itself is unlike good ones, and what shows if that is beyond doubt.
@@ -231,20 +240,18 @@ class Verdict(Stage):
         ]
         return "; or ".join(certain[:2])
 
-    def _judge(self, failed: bool, contradictions: list[str], clocks: Diagnosis) -> None:
+    def _judge(self, failed: bool, contradictions: list[str], clocks: Diagnosis | None) -> None:
         """Diagnose what was recorded, under the calibration that the run began or ended with.
 
         Args:
             failed: whether the run did.
             contradictions: what shows in the run itself, if that is beyond doubt.
-            clocks: a change of the time offset, if there is one; a single offset for the whole run
-                says less then.
+            clocks: a change of the time offset, if there is one.
         """
         found = self._diagnosed(self._result.input.rig if failed else self._final_rig())
-        ending, faults = self._result.ending, found.setup_faults
-        guess = clocks.best_guess() or found.best_guess()
-        if clocks.findings:
-            faults = clocks.findings + [fault for fault in faults if fault.kind != "time_offset"]
+        if clocks is not None:
+            found = found.with_clocks(clocks)
+        ending, faults, guess = self._result.ending, found.setup_faults, found.best_guess()
         if failed and guess:
             ending.message += f"; slam-graph doctor says: {guess}"
         elif faults and not failed:

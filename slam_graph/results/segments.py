@@ -154,14 +154,15 @@ class Segments:
         """End the last segment, if it goes on, and say how long it lasted, s.
 
         Args:
-            good_ns: time of its last state that is good; if there is none it is forgotten.
+            good_ns: time of its last state that is good, later than its first one; if there is none
+                it is forgotten.
             reason: why it ends.
         """
         self.lost = reason
         if not self.goes_on:
             return 0.0
         last = self._all[-1]
-        if good_ns is None or good_ns <= last.begin_ns:
+        if good_ns is None:
             self._all.pop()
             return 0.0
         last.end_ns, last.ended_by = good_ns, reason

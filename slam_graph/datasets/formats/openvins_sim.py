@@ -57,6 +57,10 @@ _COVARIANCE_ORDER = ("q", "p", "v", "ba", "bg")
 """Blocks of `NavState.covariance`."""
 
 
+_STATED_SIGMA = re.compile(r"\b(q|p|v|bg|ba) ([-+.0-9][^\s,;()]*)")
+"""A standard deviation in a comment: a name, and what begins like a number."""
+
+
 def _read_rig(path: Path) -> Rig:
     """The exact calibration of the simulation (``calib.yaml``).
 
@@ -105,7 +109,11 @@ def _read_states(path: Path) -> Trajectory:
 
 
 def _read_start(path: Path) -> NavState:
-    """The start state, and how well it is known, from ``init_state.csv``."""
+    """The start state, and how well it is known, from ``init_state.csv``.
+
+    Raises:
+        DataError: if the file cannot be read, or a standard deviation is no positive number.
+    """
     states = _read_states(path)
     assert states.velocities is not None
     assert states.gyro_biases is not None
@@ -116,7 +124,7 @@ def _read_start(path: Path) -> NavState:
         velocity=states.velocities[0],
         gyro_bias=states.gyro_biases[0],
         accel_bias=states.accel_biases[0],
-        covariance=_prior_covariance(path.read_text(encoding="utf-8", errors="replace")),
+        covariance=_prior_covariance(path),
     )
 
 
@@ -126,16 +134,23 @@ def _parse_states(rows: Rows) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     return stamps_from_seconds(rows, table["stamp"]), table["values"]
 
 
-def _prior_covariance(text: str) -> NDArray[np.float64]:
-    """(15, 15) from a comment like ``prior sigma: q 0.017 rad, p 0.05 m, …``."""
-    _, _, stated = text.partition("prior sigma")
-    sigmas = _DEFAULT_SIGMAS | {
-        name: float(value)
-        for name, value in re.findall(
-            r"\b(q|p|v|bg|ba) ([0-9]+(?:\.[0-9]*)?(?:e[-+]?[0-9]+)?)", stated
-        )
-    }
-    return np.diag(np.repeat([sigmas[name] ** 2 for name in _COVARIANCE_ORDER], 3))
+def _prior_covariance(path: Path) -> NDArray[np.float64]:
+    """(15, 15) from a comment like ``prior sigma: q 0.017 rad, p 0.05 m, …``.
+
+    Raises:
+        DataError: if a standard deviation is no positive number.
+    """
+    _, _, text = path.read_text(encoding="utf-8", errors="replace").partition("prior sigma")
+    variances = {name: sigma**2 for name, sigma in _DEFAULT_SIGMAS.items()}
+    for name, number in _STATED_SIGMA.findall(text.partition("\n")[0]):
+        try:
+            sigma = float(number.rstrip("."))  # at the end of a sentence
+        except ValueError:
+            sigma = 0.0
+        variances[name] = sigma * sigma
+        if sigma <= 0.0 or not 0.0 < variances[name] < np.inf:
+            raise DataError(f"{path}: prior sigma of {name}: {number!r} is no positive number")
+    return np.diag(np.repeat([variances[name] for name in _COVARIANCE_ORDER], 3))
 
 
 _ROWS_PER_TRACK_BLOCK = 8192

@@ -41,6 +41,10 @@ _SILENT = "-8"
 """FFmpeg's level of logging; damage is found and counted without its messages."""
 
 
+_MOST_FRAMES = 100_000_000
+"""No container is believed that claims more, 19 days at 60 Hz: their times take 0.8 GB."""
+
+
 def is_video(path: Path) -> bool:
     """Whether this is a video, by its name."""
     return path.is_file() and path.suffix.lower() in SUFFIXES
@@ -70,10 +74,10 @@ class _VideoReader:
     def count(self) -> int | None:
         """Number of frames according to the container; None if it gives none that can be true.
 
-        There are no more frames than bytes.
+        There are no more frames than bytes, and no more than `_MOST_FRAMES`.
         """
         count = self._capture.get(cv2.CAP_PROP_FRAME_COUNT)
-        return int(count) if 0 < count <= self._most else None
+        return int(count) if 0 < count <= min(self._most, _MOST_FRAMES) else None
 
     @property
     def rate_hz(self) -> float | None:
