@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""Array types that all modules share, the matrix of the cross product, sets of ids, and medians."""
+"""Array types that all modules share, the matrix of the cross product, and medians."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["BoolArray", "FloatArray", "IntArray", "among", "median", "skew"]
+__all__ = ["BoolArray", "FloatArray", "IntArray", "median", "skew"]
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -23,14 +23,6 @@ def skew(v: FloatArray) -> FloatArray:
     matrix[..., 2, 1], matrix[..., 0, 2], matrix[..., 1, 0] = x, y, z
     matrix[..., 1, 2], matrix[..., 2, 0], matrix[..., 0, 1] = -x, -y, -z
     return matrix
-
-
-def among(values: IntArray, ascending: IntArray) -> BoolArray:
-    """Which values (N,) are among some ascending ones (M,)."""
-    if len(ascending) == 0:
-        return np.zeros(len(values), np.bool_)
-    places = np.minimum(ascending.searchsorted(values), len(ascending) - 1)
-    return np.asarray(ascending[places] == values)
 
 
 def median(values: NDArray[Any]) -> FloatArray:

@@ -29,7 +29,7 @@ from slam_graph.backend.smoothing.state_elimination import (
 from slam_graph.backend.solve.square_root import Layout, SquareRootInformation, triangularize
 from slam_graph.backend.solve.state import dims_of
 from slam_graph.errors import ConfigError
-from slam_graph.sensors import FixCalibration
+from slam_graph.sensors import AidingData
 from slam_graph.simulation import simulate
 from slam_graph.simulation.simulated_sequence import SimulatedSequence
 
@@ -191,7 +191,7 @@ def flight(seed: int, duration_s: float) -> SimulatedSequence:
     )
 
 
-def squared_distance(found: FixCalibration) -> float:
+def squared_distance(found: AidingData.Calibration) -> float:
     """Of time offset and lever arm from the true ones, by their covariance."""
     off = found.values - np.append(-LATE_S, TRUE_ARM)
     return float(off @ np.linalg.solve(found.covariance, off))

@@ -25,8 +25,9 @@ from slam_graph.datasets.streams.aiding_files import read_fixes
 from slam_graph.datasets.streams.geodesy import geodetic_positions, local_positions
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import DataError
-from slam_graph.evaluation import ape, is_in_world_of_fixes
+from slam_graph.evaluation import ape
 from slam_graph.geometry import Similarity
+from slam_graph.pipeline.world_of_fixes import is_in_world_of_fixes
 from slam_graph.results import RunResult
 from slam_graph.sensors import AidingData, FeatureFrame
 from slam_graph.simulation import simulate

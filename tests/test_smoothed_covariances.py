@@ -23,13 +23,10 @@ from slam_graph.backend.smoothing.recording_cost import (
     LinearCost,
     LinearReprojection,
 )
-from slam_graph.backend.smoothing.recording_problem import (
-    BundleAdjustment,
-    SegmentStart,
-    SmoothingTask,
-)
+from slam_graph.backend.smoothing.recording_problem import BundleAdjustment
 from slam_graph.backend.smoothing.recording_segment import read_segment
 from slam_graph.backend.smoothing.smoothing_config import FinalBaConfig
+from slam_graph.backend.smoothing.smoothing_task import SegmentStart, SmoothingTask
 from slam_graph.backend.smoothing.state_covariances import (
     FrameInterpolation,
     KeyframeCovariances,

@@ -19,7 +19,7 @@ from slam_graph.backend.solve.state import FrameMotion
 from slam_graph.backend.window import Window
 from slam_graph.backend.window_graph import WindowGraph
 from slam_graph.errors import EstimationError
-from slam_graph.sensors import FixCalibration, Rig
+from slam_graph.sensors import AidingData, Rig
 
 
 class EstimatorKnowledge:
@@ -110,7 +110,7 @@ class EstimatorKnowledge:
         return variables.rig(self.window.state.frames)
 
     @property
-    def fix_calibration(self) -> FixCalibration | None:
+    def fix_calibration(self) -> AidingData.Calibration | None:
         """Lever arm and clock of the position fixes now; None where they are no variables."""
         if self.window is None or not self.aiding.aligned:
             return None

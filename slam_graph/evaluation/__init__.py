@@ -11,7 +11,6 @@ __all__ = [
     "ape",
     "consistency_report",
     "innovation_report",
-    "is_in_world_of_fixes",
     "mean_bounds",
     "nees_of_run",
     "rpe",
@@ -29,7 +28,6 @@ if TYPE_CHECKING:
     )
     from slam_graph.evaluation.relative_pose_error import rpe
     from slam_graph.evaluation.truth_pairing import synchronize
-    from slam_graph.evaluation.world_of_fixes import is_in_world_of_fixes
 else:
     __getattr__, __dir__ = lazy_exports(
         __name__,
@@ -44,6 +42,5 @@ else:
             ),
             "relative_pose_error": ("rpe",),
             "truth_pairing": ("synchronize",),
-            "world_of_fixes": ("is_in_world_of_fixes",),
         },
     )

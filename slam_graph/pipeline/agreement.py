@@ -13,7 +13,7 @@ from operator import attrgetter
 
 import numpy as np
 
-from slam_graph.arrays import IntArray, among
+from slam_graph.arrays import IntArray
 from slam_graph.backend import Estimator, Innovations
 from slam_graph.config import RunConfig
 from slam_graph.errors import EstimationError
@@ -197,7 +197,7 @@ class Corrections:
         if not len(ids):
             return
         ids = ids[np.concatenate([[True], ids[1:] != ids[:-1]])]
-        if np.count_nonzero(among(self._ids, ids)) < _FOUND_AGAIN * len(self._ids):
+        if np.count_nonzero(np.isin(self._ids, ids)) < _FOUND_AGAIN * len(self._ids):
             self._broken_ns = frame.stamp_ns
         self._ids = ids
 

@@ -16,7 +16,6 @@ from slam_graph.backend import Estimator
 from slam_graph.config import RunConfig, load_config
 from slam_graph.datasets import RecordedSequence, Sequence, open_dataset
 from slam_graph.errors import DataError
-from slam_graph.evaluation import is_in_world_of_fixes
 from slam_graph.frontend import build_frontend
 from slam_graph.interrupts import Interrupts
 from slam_graph.pipeline.estimation import Estimation
@@ -37,6 +36,7 @@ from slam_graph.pipeline.stage import NoObjects, Stage
 from slam_graph.pipeline.supervision import finish, outcome
 from slam_graph.pipeline.tracking import TrackedPacket, Tracking, can_overlap, packets_of
 from slam_graph.pipeline.verdict import Verdict
+from slam_graph.pipeline.world_of_fixes import is_in_world_of_fixes
 from slam_graph.results import RunInput, RunResult
 
 if TYPE_CHECKING:

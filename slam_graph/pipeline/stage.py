@@ -23,7 +23,7 @@ from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import SlamGraphError
 from slam_graph.frontend import Feedback
 from slam_graph.geometry import NavState
-from slam_graph.sensors import CameraFrame, FeatureFrame, FixCalibration, ImuData, Packet, Rig
+from slam_graph.sensors import AidingData, CameraFrame, FeatureFrame, ImuData, Packet, Rig
 
 if TYPE_CHECKING:
     from slam_graph.backend import ObjectFrame
@@ -77,7 +77,7 @@ class EstimatedFrame:
     counts: Mapping[str, float] = field(default_factory=dict)
     georeferenced: bool = False
     fix_offset_s: float = 0.0
-    fix_calibration: FixCalibration | None = None
+    fix_calibration: AidingData.Calibration | None = None
     objects: ObjectFrame | None = None
     imu_noise_at_limit: bool = False
 

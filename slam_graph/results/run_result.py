@@ -37,7 +37,7 @@ from slam_graph.results.run_picture import (
 )
 from slam_graph.results.run_summary import RunSummary
 from slam_graph.results.segments import Segments
-from slam_graph.sensors import FixCalibration, Rig
+from slam_graph.sensors import AidingData, Rig
 
 if TYPE_CHECKING:
     from slam_graph.backend import FinalBa, MovingObjects, WindowGraph
@@ -85,7 +85,7 @@ class RunResult(RunSummary):
     start_was_given: bool = False
     georeferenced: bool = False
     fix_offset_s: float = 0.0
-    fix_calibration: FixCalibration | None = None
+    fix_calibration: AidingData.Calibration | None = None
     corrected_rig: Rig | None = None
     point_map: PointMap = field(default_factory=PointMap)
     logs: RunLogs = field(default_factory=RunLogs)

@@ -6,8 +6,7 @@
 - `camera_model`: `CameraModel`, `CAMERA_MODELS` with the models by name, and how to add one.
 - `rig`: `Rig`, `RigCamera`, `ImuNoise`, `CalibrationEstimate` (the result of online calibration).
 - `measurements`: `ImuData`, `CameraFrame`, `FeatureObservations`, `FeatureFrame`, `Packet`.
-- `aiding`: `AidingData`, position fixes and odometry; `FixCalibration`, lever arm and clock of
-  the fixes.
+- `aiding`: `AidingData`, position fixes and odometry.
 - `depth`: `DepthSensor`.
 - `imu_buffer`: `ImuBuffer`, the recent samples of the IMU.
 """
@@ -26,7 +25,6 @@ __all__ = [
     "DepthSensor",
     "FeatureFrame",
     "FeatureObservations",
-    "FixCalibration",
     "ImuBuffer",
     "ImuData",
     "ImuNoise",
@@ -36,7 +34,7 @@ __all__ = [
 ]
 
 if TYPE_CHECKING:
-    from slam_graph.sensors.aiding import AidingData, FixCalibration
+    from slam_graph.sensors.aiding import AidingData
     from slam_graph.sensors.camera import Camera
     from slam_graph.sensors.camera_model import CAMERA_MODELS, CameraModel
     from slam_graph.sensors.depth import DepthSensor
@@ -53,7 +51,7 @@ else:
     __getattr__, __dir__ = lazy_exports(
         __name__,
         {
-            "aiding": ("AidingData", "FixCalibration"),
+            "aiding": ("AidingData",),
             "camera": ("Camera",),
             "camera_model": ("CAMERA_MODELS", "CameraModel"),
             "depth": ("DepthSensor",),

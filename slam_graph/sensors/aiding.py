@@ -21,40 +21,6 @@ _MAX_ODOMETRY_GAP_S = 0.5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class FixCalibration:
-    """Lever arm and clock of the position fixes.
-
-    Attributes:
-        time_offset_s: what is to be added to the times of the fixes, beyond the given offset.
-        lever_arm_m: (3,) position of the antenna in the body.
-        covariance: (4, 4) of the time offset (s), then the lever arm; zero where one is held.
-    """
-
-    time_offset_s: float
-    lever_arm_m: FloatArray
-    covariance: FloatArray
-
-    @property
-    def values(self) -> FloatArray:
-        """(4,) time offset and lever arm."""
-        return np.append(self.time_offset_s, self.lever_arm_m)
-
-    @property
-    def sigmas(self) -> FloatArray:
-        """(4,) standard deviations."""
-        return np.asarray(np.sqrt(np.diag(self.covariance)))
-
-    def table(self) -> dict[str, object]:
-        """As it is written to `metrics.json`."""
-        return {
-            "fix_offset_s": self.time_offset_s,
-            "fix_offset_sigma_s": float(self.sigmas[0]),
-            "lever_arm_m": self.lever_arm_m.tolist(),
-            "lever_arm_sigma_m": self.sigmas[1:].tolist(),
-        }
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class AidingData:
     """Position fixes, known poses and odometry of a stretch of time.
 
@@ -74,6 +40,39 @@ class AidingData:
         pose_sigmas: (K, 6) standard deviations along and about the axes of the world: position (m),
             then orientation (rad); infinite where the three of either were not measured.
     """
+
+    @dataclass(frozen=True, slots=True, eq=False)
+    class Calibration:
+        """Lever arm and clock of the position fixes.
+
+        Attributes:
+            time_offset_s: what is to be added to the times of the fixes, beyond the given offset.
+            lever_arm_m: (3,) position of the antenna in the body.
+            covariance: (4, 4) of the time offset (s), then the lever arm; zero where one is held.
+        """
+
+        time_offset_s: float
+        lever_arm_m: FloatArray
+        covariance: FloatArray
+
+        @property
+        def values(self) -> FloatArray:
+            """(4,) time offset and lever arm."""
+            return np.append(self.time_offset_s, self.lever_arm_m)
+
+        @property
+        def sigmas(self) -> FloatArray:
+            """(4,) standard deviations."""
+            return np.asarray(np.sqrt(np.diag(self.covariance)))
+
+        def table(self) -> dict[str, object]:
+            """As it is written to `metrics.json`."""
+            return {
+                "fix_offset_s": self.time_offset_s,
+                "fix_offset_sigma_s": float(self.sigmas[0]),
+                "lever_arm_m": self.lever_arm_m.tolist(),
+                "lever_arm_sigma_m": self.sigmas[1:].tolist(),
+            }
 
     fix_stamps_ns: IntArray
     fix_positions: FloatArray

@@ -15,7 +15,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from slam_graph.arrays import BoolArray, FloatArray, IntArray, among
+from slam_graph.arrays import BoolArray, FloatArray, IntArray
 from slam_graph.sensors.aiding import AidingData
 
 
@@ -246,7 +246,7 @@ class FeatureFrame:
         if len(ids) == 0:
             return self
         ascending = np.sort(ids)
-        cameras = (c.select(~among(c.ids, ascending)) for c in self.cameras)
+        cameras = (c.select(~_among(c.ids, ascending)) for c in self.cameras)
         return FeatureFrame(self.stamp_ns, tuple(cameras))
 
 
@@ -266,3 +266,11 @@ class Packet:
     imu: ImuData
     frame: CameraFrame | FeatureFrame
     aiding: AidingData | None = None
+
+
+def _among(values: IntArray, ascending: IntArray) -> BoolArray:
+    """Which values (N,) are among some ascending ones (M,)."""
+    if len(ascending) == 0:
+        return np.zeros(len(values), np.bool_)
+    places = np.minimum(ascending.searchsorted(values), len(ascending) - 1)
+    return np.asarray(ascending[places] == values)

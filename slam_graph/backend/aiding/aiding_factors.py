@@ -40,7 +40,7 @@ from slam_graph.backend.solve.state import State
 from slam_graph.backend.visual_motion import moved_to
 from slam_graph.backend.world_gauge import in_moved_world, with_unknown_gauge
 from slam_graph.geometry import NavState
-from slam_graph.sensors import AidingData, FixCalibration
+from slam_graph.sensors import AidingData
 
 _MOST_FIXES = 300
 """Fixes that are remembered for the alignment."""
@@ -181,7 +181,7 @@ class Aiding:
 
     def calibration(
         self, state: State, information: SquareRootInformation
-    ) -> FixCalibration | None:
+    ) -> AidingData.Calibration | None:
         """Lever arm and clock now; None if they are no variables.
 
         Args:

@@ -26,7 +26,7 @@ from gtsam.symbol_shorthand import A, T
 from slam_graph.arrays import FloatArray, skew
 from slam_graph.backend.aiding.fix_factors import PositionFix
 from slam_graph.backend.backend_config import GnssConfig
-from slam_graph.sensors import FixCalibration
+from slam_graph.sensors import AidingData
 
 CLOCK, ARM = int(T(2)), int(A(0))
 _CLOCK, _ARM = slice(0, 1), slice(1, 4)
@@ -65,11 +65,11 @@ class FixVariables:
             calibration[_CLOCK if key == CLOCK else _ARM] = values.atVector(key)
         return calibration
 
-    def calibration(self, values: FloatArray, covariance: FloatArray) -> FixCalibration:
+    def calibration(self, values: FloatArray, covariance: FloatArray) -> AidingData.Calibration:
         """Of values (4,) and the covariance (n, n) of the variables."""
         whole = np.zeros((4, 4))
         whole[np.ix_(self.columns, self.columns)] = covariance
-        return FixCalibration(float(values[0]), values[_ARM].copy(), whole)
+        return AidingData.Calibration(float(values[0]), values[_ARM].copy(), whole)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -24,7 +24,7 @@ from slam_graph.backend.aiding.fix_factors import FIX_LOSS
 from slam_graph.backend.smoothing.state_elimination import STATE, EliminatedStates
 from slam_graph.backend.solve.stacked_values import stacked_poses
 from slam_graph.backend.solve.state import POSE_DIM
-from slam_graph.sensors import FixCalibration
+from slam_graph.sensors import AidingData
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -55,7 +55,7 @@ class CalibratedFixes:
         """The variables (n,) to begin with."""
         return self.start[self.variables.columns]
 
-    def calibration(self, values: FloatArray, covariance: FloatArray) -> FixCalibration:
+    def calibration(self, values: FloatArray, covariance: FloatArray) -> AidingData.Calibration:
         """What is known, of values (n,) and the covariance (n, n) of the variables."""
         return self.variables.calibration(self.whole(values), covariance)
 

@@ -26,20 +26,16 @@ from slam_graph.backend.smoothing.imu_noise_estimation import ImuNoiseFactors
 from slam_graph.backend.smoothing.keyframe_aiding import aiding_of_keyframes
 from slam_graph.backend.smoothing.keyframe_states import states_at, with_angular_rates
 from slam_graph.backend.smoothing.pose_equations import PoseEquations
-from slam_graph.backend.smoothing.recording_problem import (
-    AdjustedSegment,
-    BundleAdjustment,
-    SegmentStart,
-    SmoothingTask,
-)
+from slam_graph.backend.smoothing.recording_problem import BundleAdjustment
 from slam_graph.backend.smoothing.recording_segment import RecordingSegment, read_segment
 from slam_graph.backend.smoothing.smoothing_config import FinalBaConfig
+from slam_graph.backend.smoothing.smoothing_task import AdjustedSegment, SegmentStart, SmoothingTask
 from slam_graph.backend.smoothing.track_fusion import with_fused_features
 from slam_graph.backend.solve.single_thread import on_one_thread
 from slam_graph.backend.world_gauge import in_gauge_of, in_moved_world, world_motion
 from slam_graph.errors import EstimationError
 from slam_graph.geometry import NavState, StateHistory, Trajectory
-from slam_graph.sensors import FixCalibration, Rig
+from slam_graph.sensors import AidingData, Rig
 
 logger = logging.getLogger(__name__)
 
@@ -81,7 +77,7 @@ class FinalBa:
     aligned: FloatArray | None
     noise: ImuNoiseFactors = field(default_factory=ImuNoiseFactors)
     equations: PoseEquations | None = None
-    fixes: FixCalibration | None = None
+    fixes: AidingData.Calibration | None = None
 
     @property
     def trajectory(self) -> Trajectory:

@@ -29,7 +29,6 @@ from slam_graph.sensors import (
     AidingData,
     FeatureFrame,
     FeatureObservations,
-    FixCalibration,
     ImuData,
     Packet,
     Rig,
@@ -84,7 +83,7 @@ class FrameLog:
         self._aiding: list[AidingData] = []
         self.observations = 0
         self.georeferenced, self.fix_offset_s = False, 0.0
-        self.fix_calibration: FixCalibration | None = None
+        self.fix_calibration: AidingData.Calibration | None = None
 
     @classmethod
     @contextmanager

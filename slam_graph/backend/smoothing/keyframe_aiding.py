@@ -19,7 +19,7 @@ from slam_graph.backend.aiding.world_alignment import enough_fixes
 from slam_graph.backend.backend_config import BackendConfig
 from slam_graph.backend.smoothing.calibrated_fixes import CalibratedFixes
 from slam_graph.geometry import Trajectory, interpolate
-from slam_graph.sensors import AidingData, FixCalibration
+from slam_graph.sensors import AidingData
 
 _NEAR_NS = 50_000_000
 """The velocity at a fix is the mean of so long before and after it."""
@@ -40,7 +40,9 @@ class KeyframeAiding:
 
     fixes: tuple[gtsam.NonlinearFactor, ...] = ()
     odometry: tuple[gtsam.NonlinearFactor, ...] = ()
-    source: tuple[AidingData, Trajectory, BackendConfig, FixCalibration | None] | None = None
+    source: tuple[AidingData, Trajectory, BackendConfig, AidingData.Calibration | None] | None = (
+        None
+    )
     calibrated: CalibratedFixes | None = None
 
     @property
@@ -62,7 +64,7 @@ def aiding_of_keyframes(
     data: AidingData,
     causal: Trajectory,
     config: BackendConfig,
-    found: FixCalibration | None = None,
+    found: AidingData.Calibration | None = None,
 ) -> KeyframeAiding:
     """The factors of fixes, known poses and odometry.
 
@@ -115,7 +117,7 @@ def _calibrated(
     free: list[tuple[PositionFix, tuple[gtsam.Pose3, gtsam.Pose3], int]],
     causal: Trajectory,
     variables: FixVariables,
-    found: FixCalibration,
+    found: AidingData.Calibration,
 ) -> CalibratedFixes:
     """Fixes with the poses of the body then and at their keyframes, and the numbers of these."""
     fixes = [fix for fix, _, _ in free]

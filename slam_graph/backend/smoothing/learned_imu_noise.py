@@ -21,7 +21,7 @@ from slam_graph.backend.smoothing.recording_cost import (
 from slam_graph.backend.smoothing.recording_factors import RecordingFactors
 from slam_graph.backend.smoothing.state_elimination import ChainEquations, EliminatedStates
 from slam_graph.errors import EstimationError
-from slam_graph.sensors import FixCalibration
+from slam_graph.sensors import AidingData
 
 logger = logging.getLogger(__name__)
 
@@ -72,7 +72,7 @@ class EliminatedMinimum:
     inertial: gtsam.NonlinearFactorGraph
     values: gtsam.Values
     states: EliminatedStates
-    fixes: FixCalibration | None = None
+    fixes: AidingData.Calibration | None = None
 
     def chain(self) -> ChainEquations:
         """The equations of the other factors."""

@@ -14,18 +14,15 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
-import gtsam
 import numpy as np
 
 from slam_graph.arrays import BoolArray, FloatArray, IntArray
-from slam_graph.backend.backend_config import BackendConfig
 from slam_graph.backend.cost.feature_tracks import Observations
 from slam_graph.backend.cost.reprojection import Geometry, RigProjection
 from slam_graph.backend.cost.robust_loss import RobustLoss
-from slam_graph.backend.depth_camera import is_of_depth, with_depth_camera
-from slam_graph.backend.dynamics import model_rig, without_imu
+from slam_graph.backend.depth_camera import is_of_depth
 from slam_graph.backend.smoothing.adjustment_figures import AdjustmentFigures
 from slam_graph.backend.smoothing.cost_minimization import minimized
 from slam_graph.backend.smoothing.imu_noise_estimation import ImuNoiseFactors
@@ -48,20 +45,22 @@ from slam_graph.backend.smoothing.recording_factors import (
     nearest_keyframe,
 )
 from slam_graph.backend.smoothing.recording_segment import (
-    RecordingSegment,
     longest_tracks,
     row_motions,
     triangulated,
     views,
     with_gtsam_cameras,
 )
-from slam_graph.backend.smoothing.smoothing_config import FinalBaConfig
+from slam_graph.backend.smoothing.smoothing_task import (
+    AdjustedSegment,
+    SegmentStart,
+    SmoothingTask,
+)
 from slam_graph.backend.smoothing.state_covariances import with_covariances
 from slam_graph.backend.smoothing.state_elimination import EliminatedStates
 from slam_graph.backend.smoothing.track_correlation import statistical_inefficiency
 from slam_graph.backend.solve.stacked_values import stacked_poses
-from slam_graph.geometry import NavState, Trajectory
-from slam_graph.sensors import FixCalibration, Rig
+from slam_graph.geometry import NavState
 
 logger = logging.getLogger(__name__)
 
@@ -78,82 +77,6 @@ _LOOSE_TOLERANCE = 1e-3
 
 Report = Callable[[int, int], None]
 """Is given after each step: steps so far, minimisations that are complete."""
-
-
-@dataclass(frozen=True, slots=True)
-class SmoothingTask:
-    """What does not change from segment to segment of a recording.
-
-    Attributes:
-        rig: the best calibration available.
-        backend: noise and triangulation.
-        config: settings of the bundle adjustment.
-        causal: motion between keyframes where there is no IMU to predict it.
-        least_noise: smallest factor on the noise of the IMU, or of the dynamics, that is learned.
-        joint: whether the equations at the minimum are kept, which others can be joined to.
-    """
-
-    rig: Rig
-    backend: BackendConfig
-    config: FinalBaConfig
-    causal: Trajectory | None = None
-    least_noise: float = 1.0
-    joint: bool = False
-
-    @classmethod
-    def of(
-        cls, rig: Rig, backend: BackendConfig, config: FinalBaConfig, least_noise: float = 1.0
-    ) -> SmoothingTask:
-        """The task under the dynamics that the settings choose."""
-        rig = with_depth_camera(rig)
-        if backend.dynamics.uses_imu(rig.has_imu):
-            return cls(rig, backend, config, least_noise=least_noise)
-        alone = config.model_copy(update={"average_frames": False})  # an IMU would relate them
-        rig = model_rig(rig, backend.dynamics)
-        return cls(rig, without_imu(backend, rig.has_scale), alone, least_noise=least_noise)
-
-    @property
-    def preintegration(self) -> gtsam.PreintegrationCombinedParams:
-        """Noise of the IMU by the calibration."""
-        return self.rig.imu.preintegration_params(self.backend.noise.gravity)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class SegmentStart:
-    """A segment of a recording, and where its bundle adjustment starts.
-
-    Attributes:
-        segment: times, observations, IMU samples.
-        states: initial states of the keyframes.
-        anchor: number of the keyframe whose position and yaw are fixed.
-        given: states of the keyframes before any adjustment, for `cost_before`; `states` if None.
-    """
-
-    segment: RecordingSegment
-    states: list[NavState]
-    anchor: int
-    given: list[NavState] | None = None
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class AdjustedSegment:
-    """The minimum of the cost of a segment.
-
-    Attributes:
-        states: of every frame; covariances, if known, relative to position and yaw of the anchor.
-        figures: of the minimum.
-        aligned: (N, 6, 6) pose covariances after an alignment in position and yaw, or None.
-        noise: factors on the noise of the IMU of this minimum.
-        equations: those at the minimum, if they are wanted and there are covariances.
-        fixes: lever arm and clock of position fixes, where they are variables.
-    """
-
-    states: list[NavState]
-    figures: AdjustmentFigures
-    aligned: FloatArray | None
-    noise: ImuNoiseFactors
-    equations: PoseEquations | None
-    fixes: FixCalibration | None = None
 
 
 class BundleAdjustment:

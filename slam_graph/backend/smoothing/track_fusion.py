@@ -32,11 +32,7 @@ from slam_graph.backend.smoothing.projected_matches import (
     consistent_matches,
     projected_matches,
 )
-from slam_graph.backend.smoothing.recording_problem import (
-    BundleAdjustment,
-    SegmentStart,
-    SmoothingTask,
-)
+from slam_graph.backend.smoothing.recording_problem import BundleAdjustment
 from slam_graph.backend.smoothing.recording_segment import (
     RecordingSegment,
     row_motions,
@@ -44,6 +40,7 @@ from slam_graph.backend.smoothing.recording_segment import (
     views,
     with_gtsam_cameras,
 )
+from slam_graph.backend.smoothing.smoothing_task import SegmentStart, SmoothingTask
 from slam_graph.geometry import NavState
 from slam_graph.sensors import Rig
 

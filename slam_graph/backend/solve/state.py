@@ -6,8 +6,7 @@ Keys follow GTSAM's symbols with one frame index i everywhere: `X(i)` the pose w
 i, `V(i)` its velocity in the world, `B(i)` its IMU bias, `L(j)` the position of feature j in the
 world; `E(c)`, `K(c)`, `distortion_key(c, n)` and `T(0)` are parameters of the rig (see
 `online_calibration`), `A(0)` and `T(2)` those of the position fixes (see `aiding/fix_calibration`).
-Tangents are GTSAM's (rotation before translation, both in the body frame;
-accelerometer bias before gyroscope bias).
+Tangents are GTSAM's (rotation before translation in the body frame, accelerometer bias first).
 
 First-estimates Jacobians (Huang, Mourikis & Roumeliotis 2010): once a variable takes part in the
 marginal prior, all Jacobians with respect to it are evaluated at the value it had then, its *first
