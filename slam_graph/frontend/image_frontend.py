@@ -104,7 +104,7 @@ class ImageFrontend:
                 if config.method in DESCRIPTORS:
                     associator = DescriptorMatching(camera, extractor, config, mask)
             else:
-                # it tracks its features itself only while the reference camera has no image
+                # it has features of its own only while the reference camera has no image
                 pose = rig.cameras[reference].body_T_camera
                 self._matchers[i] = StereoMatcher(
                     camera,
@@ -149,7 +149,8 @@ class ImageFrontend:
         """The features of the next frame; those of the frame before keep their ids.
 
         A camera without an image keeps its features for the next one. While a reference camera has
-        none, the cameras matched to it track their features by themselves.
+        none, the cameras matched to it track their features by themselves, and find new ones, which
+        end when it has images again.
 
         Raises:
             DataError: if the frame does not have one image per camera of the calibrated size, or
@@ -259,18 +260,17 @@ class ImageFrontend:
         return np.asarray(self._clahe.apply(image), np.uint8)
 
     def _follow(self, index: int, image: Image, stamp_ns: int) -> None:
-        """Track the features of a camera, and find new ones unless it is matched to another."""
+        """Track the features of a camera, and find new ones."""
         before = self._tracks[index]
         tracker = self._trackers[index]
         after = tracker.follow(before, image, stamp_ns, self._feedback)
-        if self._references[index] == index:
-            self._stats.add("tracked", len(after))
-            if len(after) < _FEW_FEATURES <= len(before):
-                self._diagnostics.warn(
-                    "few_features", f"{len(after)} of {len(before)} features could be followed"
-                )
-            after = tracker.replenish(before, after, self._next_id)
-            self._next_id = max(self._next_id, int(after.ids.max(initial=-1)) + 1)
+        self._stats.add("tracked", len(after))
+        if len(after) < _FEW_FEATURES <= len(before):
+            self._diagnostics.warn(
+                "few_features", f"{len(after)} of {len(before)} features could be followed"
+            )
+        after = tracker.replenish(before, after, self._next_id)
+        self._next_id = max(self._next_id, int(after.ids.max(initial=-1)) + 1)
         self._tracks[index] = after
 
     def _match(self, index: int, image: Image, stamp_ns: int, first_new_id: int) -> Tracks:
