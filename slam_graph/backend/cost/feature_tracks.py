@@ -304,29 +304,27 @@ class FeatureTracks:
     def parallax(self, before: int, after: int, turns: Sequence[FloatArray]) -> FloatArray:
         """Angles (N,) in rad between the rays to features that one camera sees in two frames.
 
-        Of a feature that several cameras see in both, the first of them counts.
+        It is the first camera that sees any feature in both, so another one than the first of the
+        rig only where that has no images.
 
         Args:
             before: a frame.
             after: another.
             turns: for each camera its rotation (3, 3) from the first frame to the second.
         """
-        counted = np.zeros(0, np.int64)
-        angles = [np.zeros(0)]
         for camera, turn in enumerate(turns):
-            of_camera = self._cameras == camera
-            i, j = (
-                np.flatnonzero((self._frames == index) & of_camera) for index in (before, after)
-            )
-            i = i[is_in(self._ids[i], self._ids[j]) & ~is_in(self._ids[i], counted)]
+            mine = self._cameras == camera
+            i, j = (np.flatnonzero((self._frames == index) & mine) for index in (before, after))
+            i = i[is_in(self._ids[i], self._ids[j])]
+            if len(i) == 0:
+                continue
             j = j[self._ids[j].searchsorted(self._ids[i])]
-            counted = ascending_union(counted, self._ids[i])
             rays = np.ones((2, len(i), 3))
             rays[:, :, :2] = self._places[1, i], self._places[1, j]
             x, y = rays / np.linalg.norm(rays, axis=2, keepdims=True)
             sines = np.linalg.norm(np.cross(x @ turn.T, y), axis=1)
-            angles.append(np.arcsin(np.minimum(sines, 1.0)))
-        return np.concatenate(angles)
+            return np.asarray(np.arcsin(np.minimum(sines, 1.0)), dtype=np.float64)
+        return np.zeros(0)
 
     def ids_in_any(self, frames: Sequence[int]) -> IntArray:
         """The features that any camera saw in some frames, ascending."""
