@@ -38,11 +38,31 @@ def test_parallax_is_of_the_place_and_not_of_the_direction() -> None:
     tracks.add(0, seen(np.eye(3), here, slice(0, 40)))
     tracks.add(1, seen(turn, here, slice(0, 40)))
     tracks.add(2, seen(turn, there, slice(10, 50)))
-    np.testing.assert_allclose(tracks.parallax(0, 1, turn.T), 0.0, atol=1e-12)
+    np.testing.assert_allclose(tracks.parallax(0, 1, [turn.T]), 0.0, atol=1e-12)
     both = POINTS[10:40]
     cosine = np.sum(both * (both - there), axis=1)
     cosine /= np.linalg.norm(both, axis=1) * np.linalg.norm(both - there, axis=1)
-    np.testing.assert_allclose(tracks.parallax(0, 2, turn.T), np.arccos(cosine), atol=1e-9)
+    np.testing.assert_allclose(tracks.parallax(0, 2, [turn.T]), np.arccos(cosine), atol=1e-9)
+
+
+def test_parallax_is_the_same_in_the_second_camera_when_the_first_one_is_lost() -> None:
+    turn, mounted = (Rotation.from_rotvec(v).as_matrix() for v in ([0.1, -0.2, 0.3], [0, 0, 0.2]))
+    turns = [turn.T, mounted.T @ turn.T @ mounted]
+    begin, end = (np.eye(3), np.zeros(3)), (turn, np.array([0.4, -0.1, 0.2]))
+
+    def angles(*parts: slice) -> NDArray[np.float64]:
+        """What each of two cameras at one place sees at the end; at the beginning they see all."""
+        tracks = FeatureTracks()
+        for index, (R, t), slices in ((0, begin, [slice(None)] * len(parts)), (1, end, parts)):
+            views = [seen(R @ M, t, s) for M, s in zip((np.eye(3), mounted), slices, strict=True)]
+            tracks.add(index, FeatureFrame(index, tuple(view.cameras[0] for view in views)))
+        return tracks.parallax(0, 1, turns)
+
+    nothing, everything = slice(0, 0), slice(None)
+    assert len(angles(everything, nothing)) == len(POINTS)
+    for parts in ((everything, everything), (nothing, everything)):
+        np.testing.assert_allclose(angles(*parts), angles(everything, nothing), atol=1e-9)
+    assert len(angles(nothing, nothing)) == 0
 
 
 @pytest.mark.parametrize("kind", [np.int64, np.int32, np.uint16])

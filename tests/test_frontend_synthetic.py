@@ -204,6 +204,25 @@ def test_tracks_survive_a_missing_left_image(texture: Spline) -> None:
         assert np.median(np.linalg.norm(motion - (4.0, 0.0), axis=1)) < 0.1
 
 
+def test_a_right_camera_goes_on_alone_when_the_left_one_is_lost(texture: Spline) -> None:
+    """It finds features of its own, and leaves them when both have images again."""
+    count = 40  # the view moves on by half of the image
+    left = [view(texture, shift(-0.0125 * WIDTH * k, 0)) for k in range(count)]
+    right = [view(texture, shift(-0.0125 * WIDTH * k - 15, 0)) for k in range(count)]
+    lost = range(2, count - 2)
+    pairs = [(None if k in lost else left[k], right[k]) for k in range(count)]
+    frames = feed(build_frontend(STEREO, CONFIG), *pairs)
+    whole = len(frames[1].cameras[0])
+    assert all(len(frames[k].cameras[0]) == 0 for k in lost)
+    assert min(len(frames[k].cameras[1]) for k in lost[2:]) > 0.8 * whole
+    own = {i for k in lost for i in frames[k].cameras[1].ids.tolist()}
+    own -= {i for frame in frames[:2] for i in frame.cameras[0].ids.tolist()}
+    assert len(frames[-1].cameras[0]) > 0.8 * whole
+    for frame in frames[-2:]:
+        assert set(frame.cameras[1].ids) <= set(frame.cameras[0].ids)
+        assert own.isdisjoint(frame.cameras[0].ids)
+
+
 def test_a_frame_without_any_image_is_empty_and_harmless(texture: Spline) -> None:
     images = [view(texture, shift(k, 0)) for k in range(3)]
     frames = feed(

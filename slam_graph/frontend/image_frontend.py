@@ -104,7 +104,7 @@ class ImageFrontend:
                 if config.method in DESCRIPTORS:
                     associator = DescriptorMatching(camera, extractor, config, mask)
             else:
-                # it tracks its features itself only while the reference camera has no image
+                # it has features of its own only while the reference camera has no image
                 pose = rig.cameras[reference].body_T_camera
                 self._matchers[i] = StereoMatcher(
                     camera,
@@ -141,6 +141,9 @@ class ImageFrontend:
             )
         self._clahe = cv2.createCLAHE(CLAHE_CLIP_LIMIT, CLAHE_TILES)
         self._tracks = [Tracks.empty() for _ in rig.cameras]
+        self._alone = {i for i, reference in enumerate(self._references) if reference == i}
+        """Cameras that find features of their own: references, and others whose last image came
+        without one of theirs."""
         self._next_id = 0
         self._depth = None if rig.depth is None else DepthSampler(rig.depth)
         self.frame_stats: dict[str, float] = {}
@@ -149,7 +152,8 @@ class ImageFrontend:
         """The features of the next frame; those of the frame before keep their ids.
 
         A camera without an image keeps its features for the next one. While a reference camera has
-        none, the cameras matched to it track their features by themselves.
+        none, the cameras matched to it track their features by themselves. From their second such
+        image on they find new ones, which end when the reference has images again.
 
         Raises:
             DataError: if the frame does not have one image per camera of the calibrated size, or
@@ -174,6 +178,7 @@ class ImageFrontend:
             reference = self._references[i]
             if image is not None and reference != i and images[reference] is not None:
                 self._tracks[i] = self._match(i, image, frame.stamp_ns, first_new_id)
+                self._alone.discard(i)
         found = [
             FeatureObservations.empty() if image is None else tracks.observations()
             for image, tracks in zip(images, self._tracks, strict=True)
@@ -259,11 +264,15 @@ class ImageFrontend:
         return np.asarray(self._clahe.apply(image), np.uint8)
 
     def _follow(self, index: int, image: Image, stamp_ns: int) -> None:
-        """Track the features of a camera, and find new ones unless it is matched to another."""
+        """Track the features of a camera, and find new ones if it is alone.
+
+        A camera that is matched to another one is not yet alone at its first image without one of
+        the other, as most often only that one is missing: what is found here would end at once.
+        """
         before = self._tracks[index]
         tracker = self._trackers[index]
         after = tracker.follow(before, image, stamp_ns, self._feedback)
-        if self._references[index] == index:
+        if index in self._alone:
             self._stats.add("tracked", len(after))
             if len(after) < _FEW_FEATURES <= len(before):
                 self._diagnostics.warn(
@@ -271,6 +280,7 @@ class ImageFrontend:
                 )
             after = tracker.replenish(before, after, self._next_id)
             self._next_id = max(self._next_id, int(after.ids.max(initial=-1)) + 1)
+        self._alone.add(index)
         self._tracks[index] = after
 
     def _match(self, index: int, image: Image, stamp_ns: int, first_new_id: int) -> Tracks:

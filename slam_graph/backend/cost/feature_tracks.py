@@ -301,23 +301,30 @@ class FeatureTracks:
         """The features that any camera saw in one frame, ascending."""
         return sorted_unique(self._ids[self._frames == index])
 
-    def parallax(self, before: int, after: int, turn: FloatArray) -> FloatArray:
-        """Angles (N,) in rad between the rays of the first camera to features in two frames.
+    def parallax(self, before: int, after: int, turns: Sequence[FloatArray]) -> FloatArray:
+        """Angles (N,) in rad between the rays to features that one camera sees in two frames.
+
+        It is the first camera that sees any feature in both, so another one than the first of the
+        rig only where that has no images.
 
         Args:
             before: a frame.
             after: another.
-            turn: (3, 3) rotation from the camera at the first frame to that at the second.
+            turns: for each camera its rotation (3, 3) from the first frame to the second.
         """
-        first = self._cameras == 0
-        i, j = (np.flatnonzero((self._frames == index) & first) for index in (before, after))
-        i = i[is_in(self._ids[i], self._ids[j])]
-        j = j[self._ids[j].searchsorted(self._ids[i])]
-        rays = np.ones((2, len(i), 3))
-        rays[:, :, :2] = self._places[1, i], self._places[1, j]
-        x, y = rays / np.linalg.norm(rays, axis=2, keepdims=True)
-        sines = np.linalg.norm(np.cross(x @ turn.T, y), axis=1)
-        return np.asarray(np.arcsin(np.minimum(sines, 1.0)), dtype=np.float64)
+        for camera, turn in enumerate(turns):
+            mine = self._cameras == camera
+            i, j = (np.flatnonzero((self._frames == index) & mine) for index in (before, after))
+            i = i[is_in(self._ids[i], self._ids[j])]
+            if len(i) == 0:
+                continue
+            j = j[self._ids[j].searchsorted(self._ids[i])]
+            rays = np.ones((2, len(i), 3))
+            rays[:, :, :2] = self._places[1, i], self._places[1, j]
+            x, y = rays / np.linalg.norm(rays, axis=2, keepdims=True)
+            sines = np.linalg.norm(np.cross(x @ turn.T, y), axis=1)
+            return np.asarray(np.arcsin(np.minimum(sines, 1.0)), dtype=np.float64)
+        return np.zeros(0)
 
     def ids_in_any(self, frames: Sequence[int]) -> IntArray:
         """The features that any camera saw in some frames, ascending."""

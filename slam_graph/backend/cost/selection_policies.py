@@ -99,11 +99,10 @@ def _is_new(
     window: Window, keyframe: int, frame: int, policy: CostPolicy, rig: RigProjection
 ) -> bool:
     """Whether a frame sees what the last keyframe did not see, or sees it from elsewhere."""
-    body_R_camera = rig.body_R_camera[0]
     both = [keyframe, frame]
     (before, after), _ = rig.when_taken(both, *window.state.poses(both))
-    turn = (after @ body_R_camera).T @ before @ body_R_camera
-    angles = window.tracks.parallax(keyframe, frame, turn)
+    turns = [(after @ R).T @ before @ R for R in rig.body_R_camera]
+    angles = window.tracks.parallax(keyframe, frame, turns)
     if len(angles) < policy.keyframe_overlap * len(window.tracks.ids_in(frame)):
         return True
     return bool(np.median(angles) > policy.keyframe_parallax_rad) if len(angles) else False
