@@ -117,7 +117,7 @@ def test_progress_of_an_adjustment_moves_and_never_ends_early(fuses: bool) -> No
         for _ in range(6):
             steps += 1
             progress.fusing(steps, rounds)
-    for passes in range(3):
+    for passes in range(4):
         for _ in range(10):
             steps += 1
             progress.solving(steps, passes)
