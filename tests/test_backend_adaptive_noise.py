@@ -4,6 +4,7 @@
 
 import numpy as np
 import pytest
+from estimating import from_given_state
 
 from slam_graph.backend.backend_config import NoiseConfig
 from slam_graph.backend.cost.adaptive_imu_noise import (
@@ -15,12 +16,11 @@ from slam_graph.backend.cost.adaptive_imu_noise import (
     DynamicsNoise,
     MotionChange,
 )
-from slam_graph.backend.estimator import Estimator
 from slam_graph.config import load_config
 from slam_graph.evaluation.consistency import nees
 from slam_graph.pipeline.run_recording import run
 from slam_graph.sensors.imu_buffer import ImuBuffer
-from slam_graph.sensors.measurements import FeatureFrame, ImuData
+from slam_graph.sensors.measurements import ImuData
 from slam_graph.sensors.rig import ImuNoise
 from slam_graph.simulation.simulation_config import SimulationConfig
 from slam_graph.simulation.simulator import simulate
@@ -160,16 +160,7 @@ def largest_gyro_factor(features: int) -> float:
     """In a flight with an IMU twelve times as noisy as its calibration says."""
     flight = {"duration_s": 6.0, "seed": 3, "imu": {"noise_scale": 12.0}}
     sequence = simulate(SimulationConfig(**flight, tracks={"features": features}))
-    config = load_config(algorithm="msckf", overrides=["backend.initialization.mode=given"])
-    estimator = Estimator(sequence.rig, config.algorithm, config.backend)
-    estimator.start(sequence.initial_state())
-    factors = []
-    for packet in sequence.packets():
-        assert isinstance(packet.frame, FeatureFrame)
-        estimator.add_imu(packet.imu)
-        estimator.add_frame(packet.frame)
-        factors.append(estimator.imu_noise[0])
-    return max(factors)
+    return max(estimator.imu_noise[0] for estimator in from_given_state(sequence, "msckf"))
 
 
 def test_a_few_tracks_do_not_judge_an_imu() -> None:

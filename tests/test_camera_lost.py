@@ -8,13 +8,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from estimating import from_given_state
 
-from slam_graph.backend.estimator import Estimator
 from slam_graph.config import load_config
 from slam_graph.datasets import RecordedSequence, open_dataset
 from slam_graph.datasets.faults.injection import inject
 from slam_graph.pipeline.run_recording import run
-from slam_graph.sensors import FeatureFrame
 from slam_graph.simulation import simulate
 
 LOST = "camera_lost:at_s=3,duration_s=60,camera={}"
@@ -27,14 +26,8 @@ def tracks() -> RecordedSequence:
 
 def frames_kept(sequence: RecordedSequence) -> float:
     """How many frames the keyframes of `okvis` reach back, on average over the last second."""
-    config = load_config(algorithm="okvis", overrides=["backend.initialization.mode=given"])
-    estimator = Estimator(sequence.rig, config.algorithm, config.backend)
-    estimator.start(sequence.initial_state())
     reach = []
-    for packet in sequence.packets():
-        assert isinstance(packet.frame, FeatureFrame)
-        estimator.add_imu(packet.imu)
-        estimator.add_frame(packet.frame)
+    for estimator in from_given_state(sequence, "okvis"):
         assert estimator.window is not None
         reach.append(estimator.window.frame - min(estimator.window.keyframes, default=0))
     return float(np.mean(reach[-20:]))

@@ -1,0 +1,24 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""An estimator that is fed with a recording, for tests that look into it on the way."""
+
+from collections.abc import Iterator
+
+from slam_graph.backend.estimator import Estimator
+from slam_graph.config import load_config
+from slam_graph.datasets import RecordedSequence
+from slam_graph.sensors.measurements import FeatureFrame
+
+
+def from_given_state(sequence: RecordedSequence, algorithm: str) -> Iterator[Estimator]:
+    """The estimator after each frame, from the state that comes with the recording."""
+    config = load_config(algorithm=algorithm, overrides=["backend.initialization.mode=given"])
+    estimator = Estimator(sequence.rig, config.algorithm, config.backend)
+    start = sequence.initial_state()
+    assert start is not None
+    estimator.start(start)
+    for packet in sequence.packets():
+        assert isinstance(packet.frame, FeatureFrame)
+        estimator.add_imu(packet.imu)
+        estimator.add_frame(packet.frame)
+        yield estimator
