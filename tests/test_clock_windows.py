@@ -22,7 +22,7 @@ from slam_graph.pipeline.stage import EstimatedFrame, NoObjects
 from slam_graph.results import RunInput, RunResult
 from slam_graph.sensors import FeatureFrame, ImuData
 
-WINDOW_S = 8.0
+WINDOW_S = ClockWindows.LENGTH_NS * 1e-9
 CHANGES_S = 10.0
 
 

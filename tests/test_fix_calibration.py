@@ -128,7 +128,7 @@ def test_the_alignment_knows_the_lever_arm_as_well_as_it_says() -> None:
         found = align_world(pairs, places[-1], True, (0.0, 0.05), (np.zeros(3), 0.2))
         assert found is not None
         off = np.append(found.offset_s - late, found.arm_m - arm)
-        squares.append(off @ np.linalg.solve(found.joint[4:, 4:], off))
+        squares.append(off @ np.linalg.solve(found.joint_covariance[4:, 4:], off))
         assert np.abs(found.arm_m - arm).max() < 0.15
     assert np.mean(squares) == pytest.approx(4.0, abs=3.3 * np.sqrt(2 * 4 / 40))
 
@@ -220,7 +220,7 @@ def test_lever_arm_and_clock_are_found_as_well_as_they_say() -> None:
         assert found is not None
         assert len(result.segments) == 1
         causal.append(squared_distance(found))
-        # how high the antenna is counts only where the body rolls or pitches
+        # x of the body is up, which is seen only where the body rolls or pitches
         assert np.abs(found.lever_arm_m - TRUE_ARM)[1:].max() < 0.05
         assert found.time_offset_s == pytest.approx(-LATE_S, abs=0.03)
         table = result.metrics["world"]
@@ -236,3 +236,19 @@ def test_lever_arm_and_clock_are_found_as_well_as_they_say() -> None:
 def test_gtsam_s_smoothers_refuse_what_they_do_not_estimate() -> None:
     with pytest.raises(ConfigError, match="lever_arm_sigma_m is not for 'fixed_lag_isam2'"):
         run(flight(0, 3.0), algorithm="fixed_lag_isam2", backend=settings(lever_arm_sigma_m=0.1))
+
+
+@pytest.mark.parametrize("sigma", [1e-3, 1e-8])
+def test_a_clock_and_a_lever_arm_that_are_known_well_do_not_hide_the_world(sigma: float) -> None:
+    """Whatever the units of the unknowns are, only what the fixes tell decides."""
+    rng = np.random.default_rng(2)
+    pairs = []
+    for k in range(40):
+        R = gtsam.Rot3.Ypr(0.1 * k, 0.05 * np.sin(k), 0.05 * np.cos(k))
+        pose = gtsam.Pose3(R, [40.0 * np.cos(0.2 * k), 60.0 * np.sin(0.1 * k), 0.1 * k])
+        position = pose.translation() + rng.normal(0.0, 1.0, 3)
+        fix = PositionFix(k * 10**9, position, np.eye(3), np.zeros(3))
+        pairs.append(PathFix(fix, pose, velocity=np.array([1.0, 0.3 * k, 0.0])))
+    found = align_world(pairs, np.zeros(3), True, (0.0, sigma), (np.zeros(3), sigma))
+    assert found is not None
+    assert found.offset_sigma_s == pytest.approx(sigma, rel=0.05)

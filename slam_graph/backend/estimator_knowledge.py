@@ -112,7 +112,7 @@ class EstimatorKnowledge:
     @property
     def fix_calibration(self) -> AidingData.Calibration | None:
         """Lever arm and clock of the position fixes now; None where they are no variables."""
-        if self.window is None or not self.aiding.aligned:
+        if self.window is None or not self.aiding.aligned or self.aiding.variables is None:
             return None
         information = self._engine.information(self.window)
         return self.aiding.calibration(self.window.state, information)

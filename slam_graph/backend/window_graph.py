@@ -20,7 +20,6 @@ import numpy as np
 from gtsam.symbol_shorthand import L, V, X
 
 from slam_graph.arrays import FloatArray
-from slam_graph.backend.aiding.fix_calibration import CLOCK
 from slam_graph.backend.cost.cost import Cost
 from slam_graph.backend.cost.feature_tracks import Observations
 from slam_graph.backend.cost.reprojection import Geometry, RigProjection
@@ -63,7 +62,7 @@ class WindowGraph:
             if kind == "e":  # increments are added to the offset from the first estimate
                 first, pose = points.atPose3(key), self.values.atPose3(key)
                 tangents[key] = gtsam.Pose3.ExpmapDerivative(first.localCoordinates(pose))
-            if kind in _CALIBRATION_KINDS and key != CLOCK:
+            if kind in _CALIBRATION_KINDS:
                 _copy_calibration(self.values, points, key)
         linear = gtsam.GaussianFactorGraph()
         for number, loss in enumerate(self.losses):

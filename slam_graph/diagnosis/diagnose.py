@@ -48,10 +48,8 @@ SETUP_KINDS = (
 """Findings about what a run was given: calibration, units and clocks."""
 _SURE_WARNINGS = ("baseline", "stereo_geometry")
 """Those that count where they are warnings too; all others where they are errors."""
-_SINGLE_OFFSET = "time_offset"
-"""Says less than a change of it does."""
-_NOT_PLAINER = SETUP_KINDS[SETUP_KINDS.index(_SINGLE_OFFSET) :]
-"""What a change of the time offset comes before."""
+_AFTER_CHANGE = SETUP_KINDS[SETUP_KINDS.index("time_offset_change") :]
+"""Findings that are less plain than a change of the time offset."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,13 +99,11 @@ class Diagnosis:
         Args:
             clocks: of the same recording, see `of_clocks`.
         """
-        found = self.findings
-        if clocks.findings:
-            kinds = [finding.kind for finding in found]
-            at = next((k for k, kind in enumerate(kinds) if kind in _NOT_PLAINER), len(found))
-            found = [*found[:at], *clocks.findings, *found[at:]]
-            found = [finding for finding in found if finding.kind != _SINGLE_OFFSET]
-        return Diagnosis(in_order(found))
+        if not clocks.findings:
+            return Diagnosis(in_order(self.findings))
+        found = [finding for finding in self.findings if finding.kind != "time_offset"]
+        at = next((k for k, f in enumerate(found) if f.kind in _AFTER_CHANGE), len(found))
+        return Diagnosis(in_order([*found[:at], *clocks.findings, *found[at:]]))
 
     @staticmethod
     def quick(recording: RecordedSequence) -> Diagnosis:

@@ -193,10 +193,9 @@ class Corrections:
 
     def note(self, frame: FeatureFrame) -> None:
         """Note whether the tracks of the frame before go on in this one."""
-        ids = np.sort(np.concatenate([seen.ids for seen in frame.cameras]))
+        ids = np.unique(np.concatenate([seen.ids for seen in frame.cameras]))
         if not len(ids):
             return
-        ids = ids[np.concatenate([[True], ids[1:] != ids[:-1]])]
         if np.count_nonzero(np.isin(self._ids, ids)) < _FOUND_AGAIN * len(self._ids):
             self._broken_ns = frame.stamp_ns
         self._ids = ids

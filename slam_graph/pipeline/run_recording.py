@@ -207,7 +207,8 @@ def _part_of(sequence: Sequence, config: RunConfig) -> RunInput:
     if isinstance(sequence, RecordedSequence):
         datum = sequence.aiding.datum
         objects = sequence.object_truth() if config.objects.enabled else {}
-        of_fixes = is_in_world_of_fixes(truth, config.backend.on_the_clock(sequence.aiding))
+        aiding = config.backend.on_the_clock(sequence.aiding)
+        of_fixes = is_in_world_of_fixes(truth, aiding, config.backend)
     return RunInput(info, config, rig, start_ns, end_ns, truth, datum, objects, of_fixes)
 
 

@@ -56,7 +56,7 @@ class EstimatedFrame:
         milliseconds: of each stage, of its parts as `stage.part`, and of all as `total`.
         counts: what the front end counts, by name.
         georeferenced: whether the world of the estimate is that of position fixes.
-        fix_offset_s: time that was found to be missing from those of the fixes.
+        fix_offset_s: added to the times of the fixes, beyond the given offset.
         fix_calibration: lever arm and clock of the fixes, where they are estimated with the states.
         objects: what moves; None where moving objects are not estimated.
         imu_noise_at_limit: whether a noise density of the IMU was raised as far as it may be.

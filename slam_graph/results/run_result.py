@@ -62,7 +62,7 @@ class RunResult(RunSummary):
         segments: stretches of it, each from a start to where the estimate was lost.
         start_was_given: whether the first state came with the data, in the world of the truth.
         georeferenced: whether the world is that of the position fixes.
-        fix_offset_s: time that was found to be missing from those of the fixes.
+        fix_offset_s: added to the times of the fixes, beyond the given offset.
         fix_calibration: lever arm and clock of the fixes at the end, where they are estimated with
             the states.
         corrected_rig: the calibration with which the run began anew; None if it did not.

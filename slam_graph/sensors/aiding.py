@@ -47,8 +47,8 @@ class AidingData:
 
         Attributes:
             time_offset_s: what is to be added to the times of the fixes, beyond the given offset.
-            lever_arm_m: (3,) position of the antenna in the body.
-            covariance: (4, 4) of the time offset (s), then the lever arm; zero where one is held.
+            lever_arm_m: (3,) position of the antenna in the body frame.
+            covariance: (4, 4) of time offset (s), then lever arm (m); zero where one is held.
         """
 
         time_offset_s: float

@@ -245,8 +245,7 @@ class FeatureFrame:
         """The frame without these features."""
         if len(ids) == 0:
             return self
-        ascending = np.sort(ids)
-        cameras = (c.select(~_among(c.ids, ascending)) for c in self.cameras)
+        cameras = (c.select(~np.isin(c.ids, ids)) for c in self.cameras)
         return FeatureFrame(self.stamp_ns, tuple(cameras))
 
 
@@ -266,11 +265,3 @@ class Packet:
     imu: ImuData
     frame: CameraFrame | FeatureFrame
     aiding: AidingData | None = None
-
-
-def _among(values: IntArray, ascending: IntArray) -> BoolArray:
-    """Which values (N,) are among some ascending ones (M,)."""
-    if len(ascending) == 0:
-        return np.zeros(len(values), np.bool_)
-    places = np.minimum(ascending.searchsorted(values), len(ascending) - 1)
-    return np.asarray(ascending[places] == values)

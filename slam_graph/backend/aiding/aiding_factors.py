@@ -47,8 +47,8 @@ _MOST_FIXES = 300
 _TIMINGS = 3
 """Alignments, each at the times that the one before has found."""
 _VAGUE = 0.5
-"""The world is taken once the path moves by less than this many σ of a fix within the standard
-deviation of an estimated time offset, and that of an estimated lever arm is smaller, too."""
+"""The world is taken once the error that time offset (by its σ times the mean speed) and lever arm
+(its σ) leave is below this many σ of a fix."""
 _MOST_VAGUE = 40
 """With so many fixes it is taken in any case: on a straight road at an even speed nothing tells
 offset and lever arm."""
@@ -71,21 +71,28 @@ class Aiding:
         aligned: whether the world is that of the fixes.
         used: whether there was anything to take so far.
         gates: of the sources of fixes, by name.
-        offset_s: time that was found to be missing from those of position fixes.
-        arm_m: (3,) lever arm of the position fixes.
-        variables: lever arm and clock, as far as they are estimated with the states.
+        offset_s: time offset: added to the times of position fixes, beyond the given one.
+        lever_arm_m: (3,) of the position fixes, body frame.
+        variables: lever arm and clock, as far as they are estimated with the states; None if
+            neither is.
     """
 
     def __init__(self, config: BackendConfig, level: bool, calibrates: bool = True) -> None:
         self._config, self._level = config, level
-        self.variables = FixVariables(config.gnss) if calibrates else None
-        self.arm_m = np.array(config.gnss.lever_arm_m)
+        variables = FixVariables(config.gnss)
+        self.variables = variables if calibrates and variables.keys else None
+        self.lever_arm_m = np.array(config.gnss.lever_arm_m)
         self._data = AidingData.empty()
         self.gates: defaultdict[str, FixGate] = defaultdict(FixGate)
         self.used, self.offset_s, self._offset_sigma_s = False, 0.0, 0.0
         self._shifted_s = 0.0  # added to the times of fixes that wait
         self._revised_ns = -_REVISED_NS
         self.restart()
+
+    @property
+    def _held(self) -> FloatArray:
+        """Time offset (s) and lever arm (m) as they are now, (4,)."""
+        return np.append(self.offset_s, self.lever_arm_m)
 
     def restart(self) -> None:
         """The estimate begins anew, in another world."""
@@ -152,7 +159,7 @@ class Aiding:
             if seen is None or self.variables is None:
                 factors.append(here.factor(key, weight))
             else:
-                noise, held = fix.covariance / weight, np.append(self.offset_s, self.arm_m)
+                noise, held = fix.covariance / weight, self._held
                 factors.append(calibrated_factor(key, seen, noise, self.variables, held))
         return factors
 
@@ -163,16 +170,16 @@ class Aiding:
             The covariance (n, n) of those that are variables; None if none are.
         """
         variables = self.variables
-        if variables is None or not variables.keys or prior is None:
+        if variables is None or prior is None:
             return None
-        found = variables.in_values(state.frames, np.append(self.offset_s, self.arm_m))
+        found = variables.in_values(state.frames, self._held)
         if self._path.states:
             last = self._path.states[-1]
             change_s = abs(float(found[0]) - self.offset_s)
-            change_m = float(np.linalg.norm(found[1:] - self.arm_m))
+            change_m = float(np.linalg.norm(found[1:] - self.lever_arm_m))
             if change_m + change_s * float(np.linalg.norm(last.velocity)) > _REVISED_M:
                 self._revised_ns = last.stamp_ns
-        self.offset_s, self.arm_m = float(found[0]), found[1:]
+        self.offset_s, self.lever_arm_m = float(found[0]), found[1:]
         return prior.covariance_of(variables.keys)
 
     def was_revised(self, stamp_ns: int) -> bool:
@@ -189,11 +196,11 @@ class Aiding:
             information: about an increment of the estimates.
         """
         variables = self.variables
-        if variables is None or not variables.keys or not self.aligned:
+        if variables is None or not self.aligned:
             return None
         covariance = self._follow(state, information)
         assert covariance is not None
-        return variables.calibration(np.append(self.offset_s, self.arm_m), covariance)
+        return variables.calibration(self._held, covariance)
 
     def _seen(
         self,
@@ -205,10 +212,10 @@ class Aiding:
     ) -> SeenFixes:
         """A fix as it is seen from the last of two poses, between which or before which it was."""
         first, last = poses
-        velocity = self._path.velocity(fix)
         if share > 0.0:
-            seconds = (stamps_ns[1] - stamps_ns[0]) * 1e-9
-            velocity = (fix.of(last) - fix.of(first)) / seconds
+            velocity = fix.velocity(first, last, (stamps_ns[1] - stamps_ns[0]) * 1e-9)
+        else:
+            velocity = self._path.velocity(fix)
         return SeenFixes.of([fix], [(then, last)], velocity, self.offset_s)
 
     def _of_unsure_sensor(
@@ -217,7 +224,7 @@ class Aiding:
         """A fix with the noise that its lever arm and clock add, for the gate."""
         assert self.variables is not None
         R = pose.rotation().matrix()[None]
-        J = seen.jacobians(R, np.append(self.offset_s, self.arm_m))[1][0]
+        J = seen.jacobians(R, self._held)[1][0]
         J = J[:, self.variables.columns]
         return replace(fix, covariance=fix.covariance + J @ unknown @ J.T)
 
@@ -234,7 +241,7 @@ class Aiding:
         self._offered = waiting.within(None, stamp_ns).shifted(-later_ns)
         self._offered_ns = stamp_ns
         self._waiting = waiting.within(stamp_ns, None).shifted(-later_ns)
-        return fixes_of(self._offered.shifted(later_ns), self._config, self.arm_m)
+        return fixes_of(self._offered.shifted(later_ns), self._config, self.lever_arm_m)
 
     def _of_unsure_time(
         self, fix: Fix, poses: tuple[gtsam.Pose3, gtsam.Pose3], stamps_ns: tuple[int, int]
@@ -242,7 +249,7 @@ class Aiding:
         """A fix with the noise that an offset of its clock which is not known well adds."""
         if not isinstance(fix, PositionFix) or not fix.is_timed or self._offset_sigma_s == 0.0:
             return fix
-        velocity = (fix.of(poses[1]) - fix.of(poses[0])) / ((stamps_ns[1] - stamps_ns[0]) * 1e-9)
+        velocity = fix.velocity(*poses, (stamps_ns[1] - stamps_ns[0]) * 1e-9)
         along = self._offset_sigma_s * velocity
         return replace(fix, covariance=fix.covariance + np.outer(along, along))
 
@@ -304,12 +311,12 @@ class Aiding:
         gnss = self._config.gnss
         if self.variables is None or gnss.lever_arm_sigma_m == 0.0:
             return None
-        return np.array(gnss.lever_arm_m) - self.arm_m, gnss.lever_arm_sigma_m
+        return np.array(gnss.lever_arm_m) - self.lever_arm_m, gnss.lever_arm_sigma_m
 
     def _is_vague(self, found: WorldAlignment, offset_ns: int) -> bool:
         """Whether clock or lever arm are known so badly that they count beside the noise."""
         gauge = len(found.covariance) + (found.offset_sigma_s > 0.0)
-        of_arm = np.diag(found.joint)[gauge:]
+        of_arm = np.diag(found.joint_covariance)[gauge:]
         if found.offset_sigma_s == 0.0 and not len(of_arm):
             return False
         timed = [
@@ -328,7 +335,7 @@ class Aiding:
         states = [with_unknown_gauge(state, found.covariance, found.centre) for state in states]
         self.aligned, self._fixes, self._path.states = True, [], list(states)
         self.offset_s, self._offset_sigma_s = self.offset_s + found.offset_s, found.offset_sigma_s
-        self.arm_m = self.arm_m + found.arm_m
+        self.lever_arm_m = self.lever_arm_m + found.arm_m
         self._waiting = self._waiting.shifted(round(found.offset_s * 1e9))
         self._shifted_s += found.offset_s
         return states
@@ -336,7 +343,7 @@ class Aiding:
     def variables_found(self, found: WorldAlignment) -> tuple[tuple[int, ...], gtsam.Values | None]:
         """Keys and values of lever arm and clock, as far as they become variables."""
         variables = self.variables
-        if variables is None or not variables.keys:
+        if variables is None:
             return (), None
-        values = np.append(self.offset_s + found.offset_s, self.arm_m + found.arm_m)
+        values = np.append(self.offset_s + found.offset_s, self.lever_arm_m + found.arm_m)
         return variables.keys, variables.values(values)

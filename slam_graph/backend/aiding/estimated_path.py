@@ -80,8 +80,9 @@ def variances_of(state: NavState) -> tuple[float, float]:
 
 
 def _velocity(fix: PositionFix, around: tuple[NavState, NavState]) -> FloatArray:
-    moved = fix.of(around[1].world_T_body) - fix.of(around[0].world_T_body)
-    return moved / ((around[1].stamp_ns - around[0].stamp_ns) * 1e-9)
+    before, after = around
+    seconds = (after.stamp_ns - before.stamp_ns) * 1e-9
+    return fix.velocity(before.world_T_body, after.world_T_body, seconds)
 
 
 def _between(around: tuple[NavState, NavState], stamp_ns: int) -> gtsam.Pose3:

@@ -2,10 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Lever arm and clock of the position fixes as variables of the state.
 
-`A(0)` is the position of the antenna in the body (m), `T(2)` the time (s) that is missing from the
-stamps of the fixes beyond the given offset. They enter the state with the world of the fixes, with
-the covariance that the alignment gives them, and are never marginalized. Variables are in the order
-clock, lever arm everywhere.
+`A(0)` is the position of the antenna in the body (m), `O(0)` the time (s) that is missing from the
+stamps of the fixes beyond the given offset. They enter the state when the world is aligned with the
+fixes, with the covariance that the alignment gives them, and are never marginalized. Variables are
+in the order clock, lever arm everywhere.
 
 A fix z between two frames is seen from one of them. With m, Q the pose of the body at its time in
 that frame, u the velocity of the antenna there (in axes of the body), a the lever arm and τ the
@@ -21,15 +21,16 @@ from dataclasses import dataclass
 
 import gtsam
 import numpy as np
-from gtsam.symbol_shorthand import A, T
+from gtsam.symbol_shorthand import A, O
 
 from slam_graph.arrays import FloatArray, skew
 from slam_graph.backend.aiding.fix_factors import PositionFix
 from slam_graph.backend.backend_config import GnssConfig
 from slam_graph.sensors import AidingData
 
-CLOCK, ARM = int(T(2)), int(A(0))
-_CLOCK, _ARM = slice(0, 1), slice(1, 4)
+CLOCK, ARM = int(O(0)), int(A(0))
+_ARM = slice(1, 4)
+_COLUMNS = {CLOCK: slice(0, 1), ARM: _ARM}
 
 
 class FixVariables:
@@ -55,18 +56,18 @@ class FixVariables:
         """The variables, of a time offset and a lever arm (4,)."""
         values = gtsam.Values()
         for key in self.keys:
-            values.insert(key, calibration[_CLOCK if key == CLOCK else _ARM])
+            values.insert(key, calibration[_COLUMNS[key]])
         return values
 
     def in_values(self, values: gtsam.Values, held: FloatArray) -> FloatArray:
         """Time offset and lever arm (4,), those that are not variables as in `held` (4,)."""
         calibration = held.copy()
         for key in self.keys:
-            calibration[_CLOCK if key == CLOCK else _ARM] = values.atVector(key)
+            calibration[_COLUMNS[key]] = values.atVector(key)
         return calibration
 
     def calibration(self, values: FloatArray, covariance: FloatArray) -> AidingData.Calibration:
-        """Of values (4,) and the covariance (n, n) of the variables."""
+        """Of time offset (s) and lever arm (m), (4,), and the covariance (n, n) of variables."""
         whole = np.zeros((4, 4))
         whole[np.ix_(self.columns, self.columns)] = covariance
         return AidingData.Calibration(float(values[0]), values[_ARM].copy(), whole)
@@ -77,17 +78,17 @@ class SeenFixes:
     """N position fixes, each seen from a pose of the body near it.
 
     Attributes:
-        positions: (N, 3) measured, in the world.
-        places: (N, 3) m, of the body at the time of the fix.
-        turns: (N, 3, 3) Q, its rotation then.
-        rates: (N, 3) u, velocity of the antenna then.
-        time_offset_s: τ₀.
+        positions: (N, 3) of the antenna as measured, in the world, m.
+        translations: (N, 3) m of the formula: the body then, in the frame of the pose, m.
+        rotations: (N, 3, 3) Q, pose_R_body then.
+        velocities: (N, 3) u, of the antenna then, in the frame of the pose, m/s.
+        time_offset_s: τ₀, with which the fixes got their times.
     """
 
     positions: FloatArray
-    places: FloatArray
-    turns: FloatArray
-    rates: FloatArray
+    translations: FloatArray
+    rotations: FloatArray
+    velocities: FloatArray
     time_offset_s: float
 
     @staticmethod
@@ -118,7 +119,7 @@ class SeenFixes:
     def in_body(self, calibration: FloatArray) -> FloatArray:
         """Where the antenna was (N, 3), seen from the poses: q, by time offset and arm (4,)."""
         late = float(calibration[0]) - self.time_offset_s
-        return self.places + self.turns @ calibration[_ARM] + late * self.rates
+        return self.translations + self.rotations @ calibration[_ARM] + late * self.velocities
 
     def residuals(
         self, rotations: FloatArray, positions: FloatArray, calibration: FloatArray
@@ -141,8 +142,8 @@ class SeenFixes:
         by_pose[:, :, :3] = -rotations @ skew(self.in_body(calibration))
         by_pose[:, :, 3:] = rotations
         by_calibration = np.empty((len(rotations), 3, 4))
-        by_calibration[:, :, 0] = np.einsum("nij,nj->ni", rotations, self.rates)
-        by_calibration[:, :, _ARM] = rotations @ self.turns
+        by_calibration[:, :, 0] = np.einsum("nij,nj->ni", rotations, self.velocities)
+        by_calibration[:, :, _ARM] = rotations @ self.rotations
         return by_pose, by_calibration
 
 
@@ -173,8 +174,7 @@ def calibrated_factor(
             by_pose, by_calibration = seen.jacobians(R, calibration)
             H[0] = np.asfortranarray(by_pose[0])
             for number, key in enumerate(variables.keys, 1):
-                columns = _CLOCK if key == CLOCK else _ARM
-                H[number] = np.asfortranarray(by_calibration[0][:, columns])
+                H[number] = np.asfortranarray(by_calibration[0][:, _COLUMNS[key]])
         return np.asarray(seen.residuals(R, p, calibration)[0])
 
     noise = gtsam.noiseModel.Gaussian.Covariance(covariance)

@@ -70,6 +70,10 @@ class PositionFix:
         """Position (3,) of the sensor in the world, at a pose of the body."""
         return np.asarray(pose.transformFrom(self.arm))
 
+    def velocity(self, before: gtsam.Pose3, after: gtsam.Pose3, seconds: float) -> FloatArray:
+        """Mean velocity (3,) of the sensor in the world between two poses of the body, m/s."""
+        return (self.of(after) - self.of(before)) / seconds
+
     def factor(self, key: int, weight: float = 1.0, robust: bool = False) -> gtsam.NoiseModelFactor:
         """The measurement of a pose.
 

@@ -53,7 +53,7 @@ def regauged(
     store = LandmarkStore()
     store.open = window.lost_features.open
     if calibration is not None:
-        covariance = found.joint
+        covariance = found.joint_covariance
         there.state.insert_calibration(calibration)
         there.state.freeze(keys)
     return replace(

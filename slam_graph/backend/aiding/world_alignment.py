@@ -35,6 +35,8 @@ _MIN_ORIENTATIONS = 3
 """Fewer orientations do not; each of them tells the whole rotation."""
 _LEAST_SHARE = 0.6
 """Part of the fixes that must fit."""
+_SINGULAR = 1e12
+"""Condition number from which the fixes tell no world, with every unknown in units of its own."""
 _ROTATION_SIGMA_RAD = 0.03
 """Largest standard deviation of a rotation that counts as known: the engine is linear over it."""
 _WIDTH = 3.4
@@ -92,8 +94,8 @@ class WorldAlignment:
         offset_s: to be added to the times of fixes with a velocity.
         offset_sigma_s: its standard deviation; zero if it is known.
         arm_m: (3,) to be added to the lever arm of these fixes.
-        joint: covariance of the gauge, then of the offset, then of the lever arm, as far as these
-            are unknown.
+        joint_covariance: of position (m) and yaw or rotation (rad), then of the offset (s), then of
+            the lever arm (m), as far as these are unknown.
     """
 
     motion: gtsam.Pose3
@@ -103,7 +105,7 @@ class WorldAlignment:
     offset_s: float = 0.0
     offset_sigma_s: float = 0.0
     arm_m: FloatArray = field(default_factory=lambda: np.zeros(3))
-    joint: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
+    joint_covariance: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
 
 
 def enough_fixes(fixes: Sequence[Fix]) -> bool:
@@ -126,7 +128,7 @@ def align_world(
         centre: (3,) the point, in the world of the estimate, about which the world turns.
         level: whether gravity is measured, so that the motion is one in position and yaw.
         offset: mean and standard deviation of what is to be added to the times of fixes with a
-            velocity, s; it is known if the latter is zero.
+            velocity, s; none is sought if the latter is zero.
         arm: mean (3,) and standard deviation of what is to be added to the lever arm of the same
             fixes, m; None if it is known.
     """
@@ -151,12 +153,13 @@ def align_world(
             return None
         motion, extra, information = path.step(motion, extra, fits.astype(np.float64))
         distances = path.distances(motion, extra)
-    if np.linalg.cond(information) > 1e12:
+    units = 1.0 / np.sqrt(np.maximum(np.diag(information), np.finfo(np.float64).tiny))
+    if np.linalg.cond(information * np.outer(units, units)) > _SINGULAR:
         return None
     whole = np.asarray(np.linalg.inv(information), np.float64)
     gauge, timed = len(whole) - len(extra), offset[1] > 0.0
     covariance = whole[:gauge, :gauge]
-    late = float(extra[0]) if timed else offset[0]
+    late = float(extra[0]) if timed else 0.0
     sigma_s = float(np.sqrt(whole[gauge, gauge])) if timed else 0.0
     if np.sqrt(np.diag(covariance)[3:].max()) > _ROTATION_SIGMA_RAD:
         return None
@@ -326,11 +329,11 @@ class _Path:
         roots = np.sqrt(weights)[:, None, None] * self.roots
         white = (roots @ J).reshape(-1, J.shape[2])
         right = np.einsum("nij,nj->ni", roots, self.residuals(motion, extra)).reshape(-1)
-        known, of_known = np.zeros((4 + len(extra), J.shape[2])), np.zeros(4 + len(extra))
+        known, of_known = np.zeros((3 + len(extra), J.shape[2])), np.zeros(3 + len(extra))
         if not count:
             known[:3, :3] = np.eye(3) / _KEPT_SIGMA_M
-        known[4:, turned:] = np.diag(1.0 / unknowns.sigmas)
-        of_known[4:] = (unknowns.expected - extra) / unknowns.sigmas
+        known[3:, turned:] = np.diag(1.0 / unknowns.sigmas)
+        of_known[3:] = (unknowns.expected - extra) / unknowns.sigmas
         white, right = np.vstack([white, known]), np.concatenate([right, of_known])
         delta = np.linalg.lstsq(white, right, rcond=None)[0]
         turn = gtsam.Rot3.Expmap(axes.T @ delta[3:turned])

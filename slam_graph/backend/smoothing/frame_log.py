@@ -59,7 +59,7 @@ class FrameLog:
         rig: the calibration with which the frames were undistorted.
         observations: number of all of them.
         georeferenced: whether the causal estimate is in the world of the position fixes.
-        fix_offset_s: time that was found to be missing from those of the fixes.
+        fix_offset_s: added to the times of the fixes, beyond the given offset.
         fix_calibration: lever arm and clock of the fixes, where they are variables.
     """
 

@@ -32,7 +32,8 @@ class KeyframeAiding:
     """Factors on keyframes.
 
     Attributes:
-        fixes: absolute ones; they determine the world of the segment.
+        fixes: absolute ones whose lever arm and clock are held; with `calibrated` they determine
+            the world of the segment.
         odometry: between consecutive keyframes.
         source: what they were made of; None for nothing.
         calibrated: fixes whose lever arm or clock is a variable; None where they are held.
@@ -51,7 +52,7 @@ class KeyframeAiding:
         return len(self.fixes) > 0 or self.calibrated is not None
 
     def shared(self) -> FloatArray:
-        """Lever arm and clock to begin with (n,), as far as they are variables."""
+        """Clock (s) and lever arm (m) to begin with (n,), as far as they are variables."""
         return np.zeros(0) if self.calibrated is None else self.calibrated.first()
 
     def at(self, stamps_ns: IntArray) -> KeyframeAiding:
@@ -127,7 +128,7 @@ def _calibrated(
     for row, (fix, (then, _), _) in enumerate(free):
         first, last = before[row] or then, after[row] or then  # one-sided at ends of the path
         sides = (before[row] is not None) + (after[row] is not None)
-        velocities[row] = (fix.of(last) - fix.of(first)) / (1e-9 * _NEAR_NS * max(sides, 1))
+        velocities[row] = fix.velocity(first, last, 1e-9 * _NEAR_NS * max(sides, 1))
     seen = SeenFixes.of(fixes, [poses for _, poses, _ in free], velocities, found.time_offset_s)
     roots = np.linalg.inv(np.linalg.cholesky(np.array([fix.covariance for fix in fixes])))
     keyframes = np.array([k for _, _, k in free], np.int64)

@@ -40,7 +40,7 @@ class Estimates:
     Attributes:
         states: X(k), V(k) and B(k) of the keyframes.
         points: (J, 3) features in the world.
-        fixes: (n,) lever arm and clock of position fixes, as far as they are variables.
+        fixes: (n,) clock (s) and lever arm (m) of position fixes, as far as they are variables.
     """
 
     states: gtsam.Values
@@ -230,13 +230,13 @@ class Factor:
         reduced, t = self.features.reduced(by_pose, by_point)
         by_state[:, :6] += reduced
         eliminated = self.features.fixes
-        if linear.fixes is None or eliminated is None:
-            states = self.states.times_covariance(by_state[:, :, None])[:, :, 0]
-            return Step(states, self.features.points(t, states[:, :6]))
-        by_pose, by_fixes = linear.fixes.gradient(len(by_state))
-        by_state[:, :6] += eliminated.reduced(by_pose, by_fixes)
+        by_fixes, shared = np.zeros(0), np.zeros(0)
+        if linear.fixes is not None and eliminated is not None:
+            by_pose, by_fixes = linear.fixes.gradient(len(by_state))
+            by_state[:, :6] += eliminated.reduced(by_pose, by_fixes)
         states = self.states.times_covariance(by_state[:, :, None])[:, :, 0]
-        shared = eliminated.step(by_fixes, states[:, :6])
+        if eliminated is not None:
+            shared = eliminated.step(by_fixes, states[:, :6])
         return Step(states, self.features.points(t, states[:, :6]), shared)
 
 

@@ -5,7 +5,7 @@
 Keys follow GTSAM's symbols with one frame index i everywhere: `X(i)` the pose world_T_body of frame
 i, `V(i)` its velocity in the world, `B(i)` its IMU bias, `L(j)` the position of feature j in the
 world; `E(c)`, `K(c)`, `distortion_key(c, n)` and `T(0)` are parameters of the rig (see
-`online_calibration`), `A(0)` and `T(2)` those of the position fixes (see `aiding/fix_calibration`).
+`online_calibration`), `A(0)` and `O(0)` those of the position fixes (see `aiding/fix_calibration`).
 Tangents are GTSAM's (rotation before translation in the body frame, accelerometer bias first).
 
 First-estimates Jacobians (Huang, Mourikis & Roumeliotis 2010): once a variable takes part in the
@@ -32,7 +32,7 @@ from slam_graph.geometry import NavState
 
 POSE_DIM, VELOCITY_DIM, BIAS_DIM, POINT_DIM = 6, 3, 6, 3
 _IMU_STATE_DIMS = {"x": POSE_DIM, "v": VELOCITY_DIM, "b": BIAS_DIM, "l": POINT_DIM}
-_CALIBRATION_DIMS = {"e": POSE_DIM, "k": 4, "t": 1, "a": 3}
+_CALIBRATION_DIMS = {"e": POSE_DIM, "k": 4, "t": 1, "a": 3, "o": 1}
 DIMS = _IMU_STATE_DIMS | _CALIBRATION_DIMS
 """Tangent dimension by the letter of the symbol. Distortion coefficients (`d`) are not here: their
 number depends on the camera model, and their keys carry it (see `distortion_key`)."""

@@ -146,9 +146,9 @@ def _prior_covariance(path: Path) -> NDArray[np.float64]:
         try:
             sigma = float(number.rstrip("."))  # at the end of a sentence
         except ValueError:
-            sigma = 0.0
+            sigma = np.nan
         variances[name] = sigma * sigma
-        if sigma <= 0.0 or not 0.0 < variances[name] < np.inf:
+        if not (sigma > 0.0 and 0.0 < variances[name] < np.inf):
             raise DataError(f"{path}: prior sigma of {name}: {number!r} is no positive number")
     return np.diag(np.repeat([variances[name] for name in _COVARIANCE_ORDER], 3))
 
