@@ -128,5 +128,5 @@ def test_a_truth_adds_the_tables_that_are_shown(tmp_path: Path) -> None:
     tables = shown.splitlines()
     assert set(first_words(tables)) <= set(first_words(printed))
     heads = [line.split() for line in tables if re.match(r"(alignment|smoothed|NEES) ", line)]
-    assert len(heads) == 3
+    assert len(heads) == 4  # the last are NEES and NEES smoothed
     assert all(head in [line.split() for line in printed] for head in heads)
