@@ -50,14 +50,19 @@ def write_inertial(path: Path, in_seconds: bool = False) -> Path:
     return path
 
 
-def write_video(folder: Path, name: str = "flight.mkv", codec: str = "FFV1") -> Path:
+def write_video(
+    folder: Path,
+    name: str = "flight.mkv",
+    codec: str = "FFV1",
+    images: list[np.ndarray] | None = None,
+) -> Path:
     """A video, without loss if nothing else is asked for, with nothing but a calibration."""
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / name
     fourcc = cv2.VideoWriter.fourcc(*codec)
     writer = cv2.VideoWriter(str(path), cv2.CAP_FFMPEG, fourcc, 20.0, SIZE, True)
     assert writer.isOpened()
-    for picture in pictures():
+    for picture in pictures() if images is None else images:
         writer.write(cv2.cvtColor(picture, cv2.COLOR_GRAY2BGR))
     writer.release()
     path.with_suffix(".yaml").write_text(CHAIN)
