@@ -13,6 +13,7 @@ from recordings import FRAME_PERIOD_NS, IMU_PERIOD_NS, SIZE, START_NS
 from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
+from rosbags.rosbag2.writer import CompressionFormat, CompressionMode
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from slam_graph.datasets.rosbag.messages import TRANSFORMS
@@ -87,12 +88,17 @@ class BagWriter:
         )
 
     def camera_info(
-        self, stamp_ns: int, frame: str, k3: float = 0.0, camera: Camera | None = None
+        self,
+        stamp_ns: int,
+        frame: str,
+        k3: float = 0.0,
+        camera: Camera | None = None,
+        size: tuple[int, int] = SIZE,
     ) -> Any:
         """Of a camera with distortion `radtan`, by default of the small made-up one."""
         fx, fy, cx, cy = INTRINSICS if camera is None else camera.intrinsics.tolist()
         distortion = DISTORTION if camera is None else camera.coefficients
-        width, height = SIZE if camera is None else (camera.width, camera.height)
+        width, height = size if camera is None else (camera.width, camera.height)
         K = np.array([fx, 0, cx, 0, fy, cy, 0, 0, 1.0])
         P = np.array([fx, 0, cx, 0, 0, fy, cy, 0, 0, 0, 1.0, 0])
         region = self.make("sensor_msgs/msg/RegionOfInterest", 0, 0, 0, 0, False)
@@ -148,14 +154,24 @@ class BagWriter:
 
 
 @contextmanager
-def bag_writer(path: Path, kind: str) -> Iterator[BagWriter]:
-    """Write a new bag."""
+def bag_writer(path: Path, kind: str, packed: str = "") -> Iterator[BagWriter]:
+    """Write a new bag.
+
+    `packed` is the format of its chunks ("bz2", "lz4"; ROS 1), or what is packed by zstd ("file",
+    "message", in MCAP "storage"; ROS 2).
+    """
     if kind == "ros1":
-        with Writer1(path) as writer:
+        writer = Writer1(path)
+        if packed:
+            writer.set_compression(Writer1.CompressionFormat[packed.upper()])
+        with writer:
             yield BagWriter(writer, get_typestore(Stores.ROS1_NOETIC), True)
         return
     plugin = StoragePlugin.SQLITE3 if kind == "sqlite" else StoragePlugin.MCAP
-    with Writer2(path, version=8, storage_plugin=plugin) as writer2:
+    writer2 = Writer2(path, version=8, storage_plugin=plugin)
+    if packed:
+        writer2.set_compression(CompressionMode[packed.upper()], CompressionFormat.ZSTD)
+    with writer2:
         yield BagWriter(writer2, get_typestore(Stores.ROS2_HUMBLE), False)
 
 
@@ -166,26 +182,30 @@ def write_bag(
     stamped: bool = True,
     extra: Callable[[BagWriter], None] | None = None,
     calibrated: bool = True,
+    cameras: int = 2,
+    size: tuple[int, int] = SIZE,
+    imu_lead: int = 20,
+    packed: str = "",
 ) -> Path:
-    """A stereo bag with IMU and poses, which carries its calibration."""
+    """A bag with images, IMU and poses, which carries its calibration."""
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / ("flight.bag" if kind == "ros1" else "flight")
     rng = np.random.default_rng(1)
-    with bag_writer(path, kind) as bag:
+    with bag_writer(path, kind, packed) as bag:
         if calibrated:
-            write_calibration(bag)
+            write_calibration(bag, cameras, size)
         if extra is not None:
             extra(bag)
-        count = 20 + (frames - 1) * FRAME_PERIOD_NS // IMU_PERIOD_NS + 5
+        count = imu_lead + (frames - 1) * FRAME_PERIOD_NS // IMU_PERIOD_NS + 5
         noise = np.random.default_rng(2).normal(0.0, 1e-3, (count, 6))
         noise[:, 5] += 9.81
         for k in range(count):
-            stamp_ns = START_NS + (k - 20) * IMU_PERIOD_NS
+            stamp_ns = START_NS + (k - imu_lead) * IMU_PERIOD_NS
             told_ns = stamp_ns if stamped else 0
             bag.write("/imu0", bag.imu(told_ns, noise[k, :3], noise[k, 3:]), stamp_ns + LAG_NS)
-            if k >= 20 and (k - 20) % 10 == 0 and (k - 20) // 10 < frames:
-                for c in range(2):
-                    image = rng.integers(0, 255, (SIZE[1], SIZE[0]), dtype=np.uint8)
+            if k >= imu_lead and (k - imu_lead) % 10 == 0 and (k - imu_lead) // 10 < frames:
+                for c in range(cameras):
+                    image = rng.integers(0, 255, (size[1], size[0]), dtype=np.uint8)
                     message = bag.image(told_ns, image, "mono8", f"cam{c}")
                     # the left image is recorded after the right one of the next frame
                     late_ns = LAG_NS if c else FRAME_PERIOD_NS + 2 * LAG_NS
@@ -212,8 +232,8 @@ def write_bag_of(sequence: RecordedSequence, path: Path, kind: str, end_ns: int)
     return path
 
 
-def write_calibration(bag: BagWriter) -> None:
-    """`CameraInfo` of two cameras, and where they are: by way of a frame between."""
+def write_calibration(bag: BagWriter, cameras: int = 2, size: tuple[int, int] = SIZE) -> None:
+    """`CameraInfo` of the cameras, and where they are: by way of a frame between."""
     begin_ns = START_NS - 10**9
     transforms = [
         bag.transform(0, "base", "imu", [0.0, 0.0, 0.1], [0.0, 0.0, 0.0, 1.0]),
@@ -222,8 +242,9 @@ def write_calibration(bag: BagWriter) -> None:
     ]
     message = bag.make(TRANSFORMS, transforms)
     bag.write("/tf_static", message, begin_ns)
-    for c in range(2):
-        bag.write(f"/cam{c}/camera_info", bag.camera_info(begin_ns, f"cam{c}"), begin_ns)
+    for c in range(cameras):
+        info = bag.camera_info(begin_ns, f"cam{c}", size=size)
+        bag.write(f"/cam{c}/camera_info", info, begin_ns)
 
 
 def write_calibration_of(bag: BagWriter, rig: Rig, places: list[str]) -> None:

@@ -14,16 +14,17 @@ from collections.abc import Callable
 from itertools import islice
 from pathlib import Path
 from resource import RUSAGE_SELF, getrusage
+from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 from map_flights import World
 from pose_graphs import laps
-from recordings import CAMERA_YAML, write_euroc, write_openvins
+from recordings import CAMERA_YAML, FRAME_PERIOD_NS, START_NS, write_euroc, write_openvins
 from recordings_loose import write_flight_video, write_video
 from recordings_public import write_kitti_raw, write_tum_rgbd
-from recordings_ros import write_bag
+from recordings_ros import BagWriter, write_bag
 
 from slam_graph.bundle_adjustment.bal_file import read_bal
 from slam_graph.config import load_config
@@ -154,9 +155,9 @@ def shorten(path: Path, lines: int) -> None:
     path.write_text("".join(path.read_text().splitlines(keepends=True)[:lines]))
 
 
-def read_all(path: Path) -> None:
+def read_all(path: Path, **options: Any) -> None:
     """Everything that a run reads of a recording."""
-    sequence = open_dataset(path)
+    sequence = open_dataset(path, **options)
     sequence.info()
     sequence.groundtruth()
     sequence.initial_state()
@@ -330,11 +331,50 @@ def test_configurations(tmp_path: Path) -> None:
     tried(path, lambda: load_config(path))
 
 
-@pytest.mark.parametrize("kind", ["ros1", "mcap_file", "sqlite"])
-def test_bags(tmp_path: Path, kind: str) -> None:
-    path = write_bag(tmp_path, kind, frames=2)
+def everything(bag: BagWriter) -> None:
+    """Depth, position fixes, known poses and odometry, besides what a bag has anyway."""
+    for stamp_ns in (START_NS, START_NS + FRAME_PERIOD_NS):
+        metres = np.full((12, 16), 1500, np.uint16)
+        place, turn = [0.1, 0.2, 0.3], [0.0, 0.0, 0.6, 0.8]
+        messages = {
+            "/depth": bag.image(stamp_ns, metres, "16UC1"),
+            "/fix": bag.fix(stamp_ns, [48.1, 11.5, 520.0]),
+            "/pose": bag.known_pose(stamp_ns, place, turn, 0.01 * np.eye(6)),
+            "/odometry": bag.odometry(stamp_ns, place, turn),
+        }
+        for topic, message in messages.items():
+            bag.write(topic, message, stamp_ns)
+
+
+SMALL = {"frames": 2, "size": (16, 12), "imu_lead": 3}
+"""Bags of 10 to 20 kB, of which the pixels are a small part."""
+
+NAMED = {"groundtruth": "/truth", "poses": "/pose", "odometry": "/odometry"}
+
+
+@pytest.mark.parametrize(
+    ("kind", "packed"),
+    [
+        *(("ros1", packed) for packed in ("", "bz2", "lz4")),
+        *(("mcap_file", packed) for packed in ("", "storage")),
+        ("sqlite", ""),
+    ],
+)
+def test_bags(tmp_path: Path, kind: str, packed: str) -> None:
+    path = write_bag(tmp_path, kind, extra=everything, packed=packed, **SMALL)
     file = path if path.is_file() else next(path.glob("*.db3"))
-    tried(file, lambda: read_all(path))
+    tried(file, lambda: read_all(file, sources=NAMED))
+
+
+@pytest.mark.parametrize("packed", ["file", "message"])
+def test_bags_packed_by_zstd(tmp_path: Path, packed: str) -> None:
+    path = write_bag(tmp_path, "sqlite", cameras=1, packed=packed, **SMALL)
+    tried(next(path.glob("*.db3*")), lambda: read_all(path))
+
+
+def test_metadata_of_bags(tmp_path: Path) -> None:
+    path = write_bag(tmp_path, "mcap", cameras=1, **SMALL)
+    tried(path / "metadata.yaml", lambda: read_all(path))
 
 
 @pytest.mark.parametrize(

@@ -311,16 +311,7 @@ def test_chunks_of_bags_unpack_within_a_bound(monkeypatch: pytest.MonkeyPatch) -
 def test_a_bag_compressed_by_zstd_is_read_within_a_bound(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, mode: str
 ) -> None:
-    from rosbags.rosbag2.writer import CompressionFormat, CompressionMode, Writer
-
-    opened = Writer.__init__
-
-    def compressed(self: Writer, *arguments: object, **options: object) -> None:
-        opened(self, *arguments, **options)  # type: ignore[arg-type]
-        self.set_compression(CompressionMode[mode], CompressionFormat.ZSTD)
-
-    monkeypatch.setattr(Writer, "__init__", compressed)
-    path = write_bag(tmp_path, "sqlite", frames=3)
+    path = write_bag(tmp_path, "sqlite", frames=3, packed=mode)
     assert open_dataset(path).info().frames == 3
     monkeypatch.setattr(bounded_unpacking, "_LEAST", 100)
     monkeypatch.setattr(bounded_unpacking, "_RATIO", 0)
@@ -331,18 +322,7 @@ def test_a_bag_compressed_by_zstd_is_read_within_a_bound(
 
 @pytest.mark.parametrize("name", ["bz2", "lz4"])
 def test_a_compressed_bag_is_read(tmp_path: Path, name: str) -> None:
-    from rosbags.rosbag1 import Writer
-
-    path = tmp_path / "flight.bag"
-    with pytest.MonkeyPatch.context() as patch:
-        opened = Writer.__init__
-
-        def compressed(self: Writer, path: Path) -> None:
-            opened(self, path)
-            self.set_compression(Writer.CompressionFormat[name.upper()])
-
-        patch.setattr(Writer, "__init__", compressed)
-        write_bag(tmp_path, "ros1", frames=3)
+    path = write_bag(tmp_path, "ros1", frames=3, packed=name)
     assert name.encode() in path.read_bytes()
     assert open_dataset(path).info().frames == 3
 

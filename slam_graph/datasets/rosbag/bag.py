@@ -5,20 +5,23 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Generator, Hashable, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from slam_graph.errors import DataError
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from rosbags.highlevel import AnyReader
+    from rosbags.rosbag1 import Reader as Reader1
+    from rosbags.rosbag2 import Reader as Reader2
     from rosbags.typesys.store import Typestore
+
+_Taken = TypeVar("_Taken")
 
 ROS1_SUFFIX, ROS2_SUFFIXES = ".bag", (".mcap", ".db3")
 
@@ -49,13 +52,25 @@ class Message:
         topic: where it was published.
         received_ns: time at which it was recorded.
         raw: its bytes.
-        decode: turns the bytes into a message object.
+        parse: turns the bytes into a message object; `decode` calls it.
+        bag: where it is from.
     """
 
     topic: str
     received_ns: int
     raw: bytes
-    decode: Callable[[], Any] = field(repr=False)
+    parse: Callable[[], Any] = field(repr=False)
+    bag: Bag = field(repr=False)
+
+    def decode(self, take: Callable[[Any], _Taken]) -> _Taken:
+        """What a function takes from the message object; also after the bag is closed.
+
+        Raises:
+            DataError: if the message is damaged, or its fields are not those of its type: a bag
+                carries the definitions of its types itself.
+        """
+        with self.bag.translated():
+            return take(self.parse())
 
 
 class Bag:
@@ -71,14 +86,16 @@ class Bag:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self._kept: AnyReader | None = None
+        self._kept: Reader1 | Reader2 | None = None
+        self._is_ros2 = path.suffix != ROS1_SUFFIX
         with self._open() as reader:
             self.topics = {
                 connection.topic: connection.msgtype
                 for connection in reader.connections
                 if connection.msgcount
             }
-            self._is_ros2 = reader.is2
+            with self.translated():
+                self._types = _types_of(path, reader)
 
     def listed(self) -> str:
         """The topics with their types in one line, for messages."""
@@ -100,15 +117,17 @@ class Bag:
         stop_ns = None if until_ns is None else until_ns + 1
         with self._open() as reader:
             wanted = [c for c in reader.connections if c.topic in topics]
+            if not wanted:  # none would mean all
+                return
             stream = reader.messages(wanted, since_ns, stop_ns)
             while True:
-                with self._translated():
+                with self.translated():
                     found = next(stream, None)
                 if found is None:
                     return
                 connection, received_ns, raw = found
-                decode = self._decoder(reader.typestore, raw, connection.msgtype)
-                yield Message(connection.topic, received_ns, raw, decode)
+                parse = partial(self._parse, raw, connection.msgtype)
+                yield Message(connection.topic, received_ns, raw, parse, self)
 
     @contextmanager
     def kept_open(self) -> Iterator[None]:
@@ -131,28 +150,23 @@ class Bag:
             seconds, nanoseconds = struct.unpack_from("<II", message.raw, 4)
         return int(seconds) * 10**9 + int(nanoseconds)  # at most 2106
 
-    def _decoder(self, types: Typestore, raw: bytes, msgtype: str) -> Callable[[], Any]:
-        """A function that decodes a message, even after the bag is closed."""
-        parse = types.deserialize_cdr if self._is_ros2 else types.deserialize_ros1
-
-        def decode() -> Any:
-            with self._translated():
-                return parse(raw, msgtype)
-
-        return decode
+    def _parse(self, raw: bytes, msgtype: str) -> Any:
+        deserialize = self._types.deserialize_cdr if self._is_ros2 else self._types.deserialize_ros1
+        return deserialize(raw, msgtype)
 
     @contextmanager
-    def _open(self) -> Iterator[AnyReader]:
+    def _open(self) -> Iterator[Reader1 | Reader2]:
         if self._kept is not None:
             yield self._kept
             return
-        from rosbags.highlevel import AnyReader  # not on import: most runs read no bag
+        from rosbags import rosbag1, rosbag2  # not on import: most runs read no bag
 
         from slam_graph.datasets.rosbag.bounded_unpacking import bound_unpacking
 
         bound_unpacking()
-        with self._translated():
-            reader = AnyReader([self.path], default_typestore=_usual_types())
+        with self.translated():
+            kind = rosbag2.Reader if self._is_ros2 else rosbag1.Reader
+            reader = kind(self.path)
             reader.open()
         try:
             yield reader
@@ -160,7 +174,7 @@ class Bag:
             reader.close()
 
     @contextmanager
-    def _translated(self) -> Iterator[None]:
+    def translated(self) -> Iterator[None]:
         """Turn any exception of the reader of a damaged bag into one line."""
         try:
             yield
@@ -171,6 +185,26 @@ class Bag:
             raise DataError(
                 f"{self.path}: this bag cannot be read ({what[:150]}); {REINDEX}"
             ) from None
+
+
+_KNOWN_TYPES: dict[Hashable, Typestore] = {}
+"""Compiled message types by their definitions: most bags have the same ones."""
+_MOST_KNOWN = 16
+
+
+def _types_of(path: Path, reader: Reader1 | Reader2) -> Typestore:
+    """The message types of an open bag, by the definitions that it carries."""
+    from rosbags.highlevel import AnyReader
+
+    key = frozenset((c.msgtype, c.msgdef, c.digest) for c in reader.connections)
+    known = _KNOWN_TYPES.get(key)
+    if known is None:
+        with AnyReader([path], default_typestore=_usual_types()) as compiler:
+            known = compiler.typestore
+        while len(_KNOWN_TYPES) >= _MOST_KNOWN:
+            del _KNOWN_TYPES[next(iter(_KNOWN_TYPES))]
+        _KNOWN_TYPES[key] = known
+    return known
 
 
 @cache

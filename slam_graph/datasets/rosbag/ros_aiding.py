@@ -5,8 +5,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import gtsam
 import numpy as np
@@ -37,6 +38,8 @@ _POSE_SIGMAS = np.array([0.05] * 3 + [0.05] * 3)
 _ASSUMED = "poses without a covariance are taken as known to 0.05 m and 0.05 rad"
 _TYPES = {"gnss": (NAV_SAT_FIX,), "odometry": (ODOMETRY,), "poses": tuple(POSES)}
 """Of the messages of each sensor."""
+
+_Taken = TypeVar("_Taken")
 
 Messages = Callable[[list[str]], Iterable[Message]]
 
@@ -110,10 +113,9 @@ class BagAiding:
         covariances: list[FloatArray] = []
         for message in messages:
             stamps.append(stamp_ns(message))
-            fix = _decoded(message)
-            solved = fix is not None and fix.status.status >= 0
-            places.append([fix.latitude, fix.longitude, fix.altitude] if solved else [np.nan] * 3)
-            covariances.append(_covariance_of(fix) if solved else _UNKNOWN)
+            place, covariance = _decoded(message, _fix_of, ([np.nan] * 3, _UNKNOWN))
+            places.append(place)
+            covariances.append(covariance)
         return fixes_from(
             np.array(stamps, np.int64),
             np.array(places).reshape(-1, 3),
@@ -132,9 +134,8 @@ class BagAiding:
         sigmas: list[FloatArray] = []
         for message in messages:
             stamps.append(stamp_ns(message))
-            found = _decoded(message)
-            rows.append([np.nan] * 7 if found is None else pose_of(found, kind))
-            sigmas.append(np.full(6, np.nan) if found is None else pose_sigmas_of(found))
+            rows.append(_decoded(message, partial(pose_of, msgtype=kind), [np.nan] * 7))
+            sigmas.append(_decoded(message, pose_sigmas_of, np.full(6, np.nan)))
         if not stamps:
             raise DataError(f"{self._bag.path}: no poses on '{self._topics['poses']}'")
         poses, known = np.array(rows), np.array(sigmas)
@@ -160,10 +161,9 @@ class BagAiding:
         base: str | None = None
         for message in messages:
             stamps.append(stamp_ns(message))
-            found = _decoded(message)
-            rows.append([np.nan] * 7 if found is None else pose_of(found, ODOMETRY))
-            if base is None and found is not None:
-                base = str(found.child_frame_id)
+            rows.append(_decoded(message, partial(pose_of, msgtype=ODOMETRY), [np.nan] * 7))
+            if base is None:
+                base = _decoded(message, lambda odometry: str(odometry.child_frame_id), None)
         stamps_ns, poses = np.array(stamps, np.int64), np.array(rows).reshape(-1, 7)
         lengths = np.linalg.norm(poses[:, 3:], axis=1)
         good = np.isfinite(poses).all(axis=1) & (lengths >= _SHORTEST_QUATERNION)
@@ -183,12 +183,19 @@ class BagAiding:
         return path_between(self._bag, base, frame_of(self._bag, self._body), otherwise)
 
 
-def _decoded(message: Message) -> Any:
-    """A message; None where it is damaged."""
+def _decoded(message: Message, take: Callable[[Any], _Taken], otherwise: _Taken) -> _Taken:
+    """What a function takes from a message; something else where that is damaged."""
     try:
-        return message.decode()
+        return message.decode(take)
     except DataError:
-        return None
+        return otherwise
+
+
+def _fix_of(fix: Any) -> tuple[list[float], FloatArray]:
+    """Latitude, longitude, altitude and covariance; NaN where the receiver had no solution."""
+    if fix.status.status < 0:
+        return [np.nan] * 3, _UNKNOWN
+    return [fix.latitude, fix.longitude, fix.altitude], _covariance_of(fix)
 
 
 def _covariance_of(fix: Any) -> FloatArray:

@@ -97,6 +97,12 @@ class RosBagSequence(GroupedSequence):
         options = options or ReaderOptions()
         self.path = path
         self._bag = Bag(path)
+        with self._bag.kept_open():
+            self._set_up(options)
+
+    def _set_up(self, options: ReaderOptions) -> None:
+        """Topics, calibration and the size of the first images."""
+        path = self.path
         chain, cameras = options.calibration, options.cameras
         topics = find_topics(self._bag, options.sources, chain)
         self._imu_topic, self._truth_topic = topics.imu, topics.groundtruth
@@ -108,8 +114,7 @@ class RosBagSequence(GroupedSequence):
         else:
             count = len(topics.cameras) if cameras is None else cameras
             used = replace(topics, cameras=topics.cameras[:count])
-            with self._bag.kept_open():
-                rig = read_bag_rig(self._bag, used, unknown)
+            rig = read_bag_rig(self._bag, used, unknown)
         if topics.imu is not None and rig.imu is unknown:
             what = "no noise densities of the IMU are given; those of EuRoC's are assumed"
             options.diagnostics.warn("imu_noise_assumed", f"{path}: {what}")
@@ -122,15 +127,13 @@ class RosBagSequence(GroupedSequence):
             )
         rig = replace(options.select(rig), has_imu=topics.imu is not None)
         self._cameras = topics.cameras[: len(rig.cameras)]
-        with self._bag.kept_open():
-            self._depth_topic, rig = find_depth(self._bag, topics, rig, options.diagnostics)
+        self._depth_topic, rig = find_depth(self._bag, topics, rig, options.diagnostics)
         truth = None if topics.groundtruth is None else self._read_poses
         super().__init__(path.stem, rig, self._cameras, None, options, truth)
-        with self._bag.kept_open():
-            for k, topic in enumerate(self._cameras):
-                self._check_first_images(topic, k)
-            self._finish_depth = None if rig.depth is None else DepthFinish.of(rig)
-            self._check_first_depth()
+        for k, topic in enumerate(self._cameras):
+            self._check_first_images(topic, k)
+        self._finish_depth = None if rig.depth is None else DepthFinish.of(rig)
+        self._check_first_depth()
 
     @property
     def _topics(self) -> list[str]:
@@ -252,7 +255,7 @@ class RosBagSequence(GroupedSequence):
     def _depth(self, message: Message) -> Metres | Fault:
         where = self._where(message)
         try:
-            raw = depth_of(message.decode(), where)
+            raw = message.decode(partial(depth_of, where=where))
         except DataError as error:
             return Fault("depth_unreadable", str(error))
         assert self._finish_depth is not None
@@ -285,14 +288,14 @@ class RosBagSequence(GroupedSequence):
 
     def _image(self, message: Message) -> Image | Fault:
         try:
-            return image_of(message.decode(), self._where(message))
+            return message.decode(partial(image_of, where=self._where(message)))
         except DataError as error:
             return Fault("image_unreadable", str(error))
 
     def _inertial(self, message: Message) -> list[float]:
         """Rate and specific force; NaN where the message is damaged."""
         try:
-            return inertial_of(message.decode())
+            return message.decode(inertial_of)
         except DataError:
             return [np.nan] * 6
 
@@ -358,7 +361,7 @@ class RosBagSequence(GroupedSequence):
     def _pose(self, message: Message) -> list[float]:
         """Position and quaternion; NaN where the message is damaged."""
         try:
-            return pose_of(message.decode(), self._bag.topics[message.topic])
+            return message.decode(partial(pose_of, msgtype=self._bag.topics[message.topic]))
         except DataError:
             return [np.nan] * 7
 

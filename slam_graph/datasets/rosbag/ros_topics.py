@@ -9,11 +9,11 @@ from __future__ import annotations
 
 import re
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import gtsam
 import numpy as np
@@ -31,6 +31,8 @@ from slam_graph.datasets.rosbag.messages import (
 )
 from slam_graph.errors import DataError
 from slam_graph.sensors import CAMERA_MODELS, Camera, ImuNoise, Rig, RigCamera
+
+_Taken = TypeVar("_Taken")
 
 
 @dataclass(frozen=True, slots=True)
@@ -136,20 +138,19 @@ def read_bag_rig(bag: Bag, topics: Topics, noise: ImuNoise) -> Rig:
         DataError: if a part is missing; it names ``--calibration`` as the way out.
     """
     first = topics.imu or topics.cameras[0]
-    body = str(_first(bag, first).header.frame_id)
+    body = frame_of(bag, first)
     transforms = _static_transforms(bag)
     mounted = []
     for k, topic in enumerate(topics.cameras):
-        info = _info(bag, topic)
-        camera = _camera(bag, info, rectified="rect" in topic.rpartition("/")[2])
-        body_T_camera = _path(bag, transforms, body, str(info.header.frame_id))
+        camera = own_camera(bag, topic)
+        body_T_camera = _path(bag, transforms, body, frame_of(bag, _beside(bag, topic)))
         mounted.append(RigCamera(camera, body_T_camera, 0.0, f"cam{k}"))
     return Rig(tuple(mounted), noise)
 
 
 def frame_of(bag: Bag, topic: str) -> str:
     """The frame of the messages on a topic."""
-    return _plain(str(_first(bag, topic).header.frame_id))
+    return _first(bag, topic, lambda message: _plain(str(message.header.frame_id)))
 
 
 def own_camera(bag: Bag, topic: str) -> Camera:
@@ -158,8 +159,8 @@ def own_camera(bag: Bag, topic: str) -> Camera:
     Raises:
         DataError: if there is none, or it cannot be used.
     """
-    info = _info(bag, topic)
-    return _camera(bag, info, rectified="rect" in topic.rpartition("/")[2])
+    rectified = "rect" in topic.rpartition("/")[2]
+    return _first(bag, _beside(bag, topic), lambda info: _camera(bag, info, rectified))
 
 
 _OTHERWISE = "give --calibration"
@@ -180,17 +181,17 @@ def path_between(bag: Bag, begin: str, end: str, otherwise: str = _OTHERWISE) ->
     return _path(bag, _static_transforms(bag), begin, end, otherwise)
 
 
-def _first(bag: Bag, topic: str) -> Any:
-    """The first message of a topic, which has one."""
+def _first(bag: Bag, topic: str, take: Callable[[Any], _Taken]) -> _Taken:
+    """What a function takes from the first message of a topic, which has one."""
     with closing(bag.messages([topic])) as messages:
         message = next(messages, None)
     if message is None:
         raise DataError(f"{bag.path}: no message on '{topic}' can be read; {REINDEX}")
-    return message.decode()
+    return message.decode(take)
 
 
-def _info(bag: Bag, topic: str) -> Any:
-    """The calibration of the camera that publishes images under a topic."""
+def _beside(bag: Bag, topic: str) -> str:
+    """The topic with the calibration of the camera that publishes images under a topic."""
     base = topic if bag.topics[topic] == IMAGE else topic.rpartition("/")[0]
     beside = f"{base.rpartition('/')[0]}/camera_info"
     if bag.topics.get(beside) != CAMERA_INFO:
@@ -198,7 +199,7 @@ def _info(bag: Bag, topic: str) -> Any:
             f"{bag.path}: no calibration: no topic '{beside}'; give --calibration; "
             f"the bag has {bag.listed()}"
         )
-    return _first(bag, beside)
+    return beside
 
 
 def _camera(bag: Bag, info: Any, rectified: bool) -> Camera:
@@ -230,14 +231,21 @@ def _static_transforms(bag: Bag) -> dict[str, dict[str, gtsam.Pose3]]:
     if bag.topics.get(_STATIC_TOPIC) != TRANSFORMS:
         return known
     for message in bag.messages([_STATIC_TOPIC]):
-        for stamped in message.decode().transforms:
-            parent, child = _plain(stamped.header.frame_id), _plain(stamped.child_frame_id)
-            move, turn = stamped.transform.translation, stamped.transform.rotation
-            rotation = gtsam.Rot3.Quaternion(turn.w, turn.x, turn.y, turn.z)
-            pose = gtsam.Pose3(rotation, np.array([move.x, move.y, move.z]))
+        for parent, child, pose in message.decode(_transforms_of):
             known.setdefault(parent, {})[child] = pose
             known.setdefault(child, {})[parent] = pose.inverse()
     return known
+
+
+def _transforms_of(message: Any) -> list[tuple[str, str, gtsam.Pose3]]:
+    """Parent, child and parent_T_child of the transforms in a message."""
+    found = []
+    for stamped in message.transforms:
+        move, turn = stamped.transform.translation, stamped.transform.rotation
+        rotation = gtsam.Rot3.Quaternion(turn.w, turn.x, turn.y, turn.z)
+        pose = gtsam.Pose3(rotation, np.array([move.x, move.y, move.z]))
+        found.append((_plain(stamped.header.frame_id), _plain(stamped.child_frame_id), pose))
+    return found
 
 
 def _path(
