@@ -87,8 +87,8 @@ def write_groundtruth(mav0: Path, columns: int, count: int, start_ns: int = STAR
     write_lines(folder / "data.csv", lines)
 
 
-def write_openvins(folder: Path, frames: int = 6, features: int = 12) -> Path:
-    """A folder like the simulation dumped from OpenVINS, with two cameras."""
+def write_openvins(folder: Path, frames: int = 6, features: int = 12, cameras: int = 2) -> Path:
+    """A folder like the simulation dumped from OpenVINS."""
     folder.mkdir(parents=True)
     (folder / "calib.yaml").write_text(
         "imu: {rate_hz: 200, gyro_noise_density: 0.00017, gyro_random_walk: 0.00002,\n"
@@ -99,13 +99,13 @@ def write_openvins(folder: Path, frames: int = 6, features: int = 12) -> Path:
             "    intrinsics: [458.6, 457.2, 367.2, 248.3]\n"
             "    distortion_coeffs: [-0.283, 0.0739, 0.00019, 1.76e-05]\n"
             f"    T_imu_cam: [[0, 0, 1, {0.1 * c}], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1]]\n"
-            for c in range(2)
+            for c in range(cameras)
         )
     )
     rng = np.random.default_rng(3)
     tracks = ["#t[s],cam_id,feature_id,u_px,v_px"]
     for k in range(frames):
-        for c in range(2):
+        for c in range(cameras):
             pixels = rng.uniform((10, 10), (740, 470), (features, 2)).tolist()
             tracks += [
                 f"{100 + k // 10}.{k % 10}00000001,{c},{7 * i},{u},{v}"

@@ -77,12 +77,12 @@ def write_flight_video(folder: Path) -> Path:
     return path
 
 
-def write_image_folder(folder: Path, inertial: bool = True) -> Path:
+def write_image_folder(folder: Path, inertial: bool = True, count: int = 8) -> Path:
     """Numbered images, their times in a table without names."""
     (folder / "images").mkdir(parents=True)
-    for k, picture in enumerate(pictures()):
+    for k, picture in enumerate(pictures(count)):
         cv2.imwrite(str(folder / "images" / f"frame{k + 6}.png"), picture)
-    write_times(folder / "timestamps.csv", in_seconds=True)
+    write_times(folder / "timestamps.csv", in_seconds=True, count=count)
     (folder / "calibration.yaml").write_text(CHAIN)
     if inertial:
         write_inertial(folder / "imu.csv", in_seconds=True)

@@ -22,8 +22,8 @@ import pytest
 from map_flights import World
 from pose_graphs import laps
 from recordings import CAMERA_YAML, FRAME_PERIOD_NS, START_NS, write_euroc, write_openvins
-from recordings_loose import write_flight_video, write_video
-from recordings_public import write_kitti_raw, write_tum_rgbd
+from recordings_loose import write_flight_video, write_image_folder, write_video
+from recordings_public import write_kitti_odometry, write_kitti_raw, write_tum_rgbd
 from recordings_ros import BagWriter, write_bag
 
 from slam_graph.bundle_adjustment.bal_file import read_bal
@@ -241,7 +241,7 @@ def test_recordings(tracks: Path, tmp_path: Path, name: str) -> None:
     "name", ["calib.yaml", "tracks.csv", "imu.csv", "groundtruth.csv", "init_state.csv"]
 )
 def test_openvins(tmp_path: Path, name: str) -> None:
-    folder = write_openvins(tmp_path / "flight", frames=3, features=4)
+    folder = write_openvins(tmp_path / "flight", frames=3, features=4, cameras=1)
     shorten(folder / "imu.csv", 70)
     tried(folder / name, lambda: read_all(folder))
 
@@ -262,12 +262,29 @@ def test_tum_rgbd(tmp_path: Path, name: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "name", ["calib_cam_to_cam.txt", "calib_imu_to_velo.txt", "timestamps.txt"]
+    "name",
+    [
+        *("calib_cam_to_cam.txt", "calib_imu_to_velo.txt", "calib_velo_to_cam.txt"),
+        *("timestamps.txt", "0000000001.txt"),
+    ],
 )
 def test_kitti(tmp_path: Path, name: str) -> None:
-    folder = write_kitti_raw(tmp_path / "2011_09_26", frames=4)
+    folder = write_kitti_raw(tmp_path / "2011_09_26", frames=2)
     file = next(iter(sorted((tmp_path / "2011_09_26").rglob(name))))
     tried(file, lambda: read_all(folder))
+
+
+@pytest.mark.parametrize("name", ["calib.txt", "times.txt", "03.txt"])
+def test_kitti_odometry(tmp_path: Path, name: str) -> None:
+    folder = write_kitti_odometry(tmp_path, frames=3)
+    tried(next(tmp_path.rglob(name)), lambda: read_all(folder))
+
+
+@pytest.mark.parametrize("name", ["timestamps.csv", "imu.csv", "calibration.yaml"])
+def test_image_folder(tmp_path: Path, name: str) -> None:
+    folder = write_image_folder(tmp_path / "flight", count=3)
+    shorten(folder / "imu.csv", 50)
+    tried(folder / name, lambda: read_all(folder))
 
 
 def test_masks(tmp_path: Path) -> None:
