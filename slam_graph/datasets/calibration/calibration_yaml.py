@@ -16,7 +16,7 @@ from slam_graph.arrays import FloatArray
 from slam_graph.errors import DataError
 from slam_graph.settings import ConfigTree
 
-_ROTATION_TOLERANCE = 1e-3
+ROTATION_TOLERANCE = 1e-3
 """Largest element of R Rᵀ - I for which R counts as a rotation; files may have four digits only."""
 
 MAX_OFFSET_S = 1e8
@@ -161,7 +161,7 @@ def pose_from_matrix(matrix: FloatArray, where: str) -> gtsam.Pose3:
     R = matrix[:3, :3]
     with np.errstate(over="ignore", invalid="ignore"):
         defect = float(np.max(np.abs(R @ R.T - np.eye(3))))
-    if not defect <= _ROTATION_TOLERANCE or np.linalg.det(R) < 0:
+    if not defect <= ROTATION_TOLERANCE or np.linalg.det(R) < 0:
         raise DataError(
             f"{where}: the upper left 3x3 block is not a rotation "
             f"(|R Rᵀ - I| = {defect:.2g}, det = {np.linalg.det(R):.3g})"

@@ -17,7 +17,8 @@ import gtsam
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from slam_graph.arrays import FloatArray
+from slam_graph.arrays import BoolArray, FloatArray
+from slam_graph.datasets.calibration.calibration_yaml import ROTATION_TOLERANCE
 from slam_graph.datasets.calibration.kalibr_calibration import read_kalibr
 from slam_graph.datasets.formats.kitti_files import (
     increasing,
@@ -84,7 +85,14 @@ class KittiOdometrySequence(ImageSequence):
             raise DataError(
                 f"{self._poses}: {len(matrices)} poses, {self.path} has {len(self._times_ns)} times"
             )
-        kept = np.flatnonzero(np.diff(self._times_ns, prepend=self._times_ns[0] - 1) > 0)
+        later = np.diff(self._times_ns, prepend=self._times_ns[0] - 1) > 0
+        poses = _are_poses(matrices)
+        for k in np.flatnonzero(later & ~poses):
+            what = f"{self._poses}: row {k + 1} is not a finite pose, dropped"
+            self.diagnostics.warn("groundtruth_not_finite", what)
+        kept = later & poses
+        if not kept.any():
+            raise DataError(f"{self._poses}: no pose of this file can be used")
         rotations = _WORLD_R_CAMERA0 @ matrices[kept, :, :3]
         return Trajectory(
             self._times_ns[kept],
@@ -106,6 +114,16 @@ def _read_poses(path: Path) -> FloatArray:
     if not blocks:
         raise DataError(f"{path}: no poses in this file")
     return np.concatenate(blocks).reshape(-1, 3, 4)
+
+
+def _are_poses(matrices: FloatArray) -> BoolArray:
+    """Which matrices (N, 3, 4) are finite, with a rotation in their first three columns."""
+    R = matrices[:, :, :3]
+    with np.errstate(over="ignore", invalid="ignore"):
+        defects = np.abs(R @ R.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
+        proper = np.linalg.det(R) > 0.0
+    finite = np.isfinite(matrices).all(axis=(1, 2))
+    return np.asarray(finite & proper & (defects <= ROTATION_TOLERANCE), bool)
 
 
 def _read_rig(path: Path, streams: list[FileImages]) -> Rig:

@@ -35,7 +35,11 @@ from slam_graph.datasets.formats.kitti_files import (
 )
 from slam_graph.datasets.formats.tum_rgbd import rectifier
 from slam_graph.datasets.sequence import ReaderOptions
-from slam_graph.datasets.streams.aiding_files import covariances_of, fixes_from
+from slam_graph.datasets.streams.aiding_files import (
+    LARGEST_GEODETIC,
+    covariances_of,
+    fixes_from,
+)
 from slam_graph.datasets.streams.image_sequence import ImageSequence
 from slam_graph.datasets.streams.images import Fault, FileImages, Image
 from slam_graph.datasets.streams.imu_stream import clean_blocks
@@ -116,7 +120,8 @@ class _Oxts:
         """
         stamps_ns = self.stamps_ns
         values = np.array([self._read(k) for k in range(len(stamps_ns))])
-        whole = np.flatnonzero(np.isfinite(values).all(axis=1))
+        on_earth = (np.abs(values[:, POSITION]) <= LARGEST_GEODETIC).all(axis=1)
+        whole = np.flatnonzero(np.isfinite(values).all(axis=1) & on_earth)
         for k in np.setdiff1d(np.arange(len(values)), whole):
             diagnostics.warn("groundtruth_not_finite", f"{self.where(int(k))}: no pose")
         timestamps = self.folder / "timestamps.txt"

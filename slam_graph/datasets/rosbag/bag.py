@@ -88,14 +88,10 @@ class Bag:
         self.path = path
         self._kept: Reader1 | Reader2 | None = None
         self._is_ros2 = path.suffix != ROS1_SUFFIX
-        with self._open() as reader:
-            self.topics = {
-                connection.topic: connection.msgtype
-                for connection in reader.connections
-                if connection.msgcount
-            }
-            with self.translated():
-                self._types = _types_of(path, reader)
+        with self._open() as reader, self.translated():
+            self.topics = _topics_of(reader)
+            self._types = _types_of(path, reader)
+        self._checked: set[str] = set()
 
     def listed(self) -> str:
         """The topics with their types in one line, for messages."""
@@ -151,6 +147,9 @@ class Bag:
         return int(seconds) * 10**9 + int(nanoseconds)  # at most 2106
 
     def _parse(self, raw: bytes, msgtype: str) -> Any:
+        if msgtype not in self._checked:
+            _check_arrays(self._types, msgtype)
+            self._checked.add(msgtype)
         deserialize = self._types.deserialize_cdr if self._is_ros2 else self._types.deserialize_ros1
         return deserialize(raw, msgtype)
 
@@ -187,6 +186,14 @@ class Bag:
             ) from None
 
 
+def _topics_of(reader: Reader1 | Reader2) -> dict[str, str]:
+    """The type of the messages of each topic that has some."""
+    names = [(c.topic, c.msgtype) for c in reader.connections if c.msgcount]
+    if not all(isinstance(text, str) for name in names for text in name):
+        raise ValueError("a topic or its type is not a text")
+    return dict(names)
+
+
 _KNOWN_TYPES: dict[Hashable, Typestore] = {}
 """Compiled message types by their definitions: most bags have the same ones."""
 _MOST_KNOWN = 16
@@ -205,6 +212,31 @@ def _types_of(path: Path, reader: Reader1 | Reader2) -> Typestore:
             del _KNOWN_TYPES[next(iter(_KNOWN_TYPES))]
         _KNOWN_TYPES[key] = known
     return known
+
+
+_LONGEST_ARRAY = 1000
+"""Of strings or messages, in a message type. For each element there are lines of compiled code."""
+
+
+def _check_arrays(types: Typestore, msgtype: str) -> None:
+    """Refuse a type whose compiled code would be long: `Header[1000000000]` is 20 bytes in a bag.
+
+    Raises:
+        ValueError: if it has such an array, itself or in a type that it is made of.
+    """
+    from rosbags.interfaces import Nodetype
+
+    known, waiting = {msgtype}, [msgtype]
+    while waiting:
+        for name, (kind, what) in types.fielddefs[waiting.pop()][1]:
+            length: Any = what[1] if kind == Nodetype.ARRAY else 0
+            inner: Any = what[0] if kind in (Nodetype.ARRAY, Nodetype.SEQUENCE) else (kind, what)
+            is_number = inner[0] == Nodetype.BASE and inner[1][0] != "string"
+            if length > _LONGEST_ARRAY and not is_number:
+                raise ValueError(f"{name} in messages of type {msgtype} is an array of {length}")
+            if inner[0] == Nodetype.NAME and inner[1] not in known:
+                known.add(inner[1])
+                waiting.append(inner[1])
 
 
 @cache

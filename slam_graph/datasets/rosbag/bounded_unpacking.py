@@ -1,12 +1,15 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""Chunks of bags are unpacked up to a bound: 10 kB of bzip2 can hold gigabytes of zeros."""
+"""Bags are unpacked up to a bound: 10 kB of bzip2 can hold gigabytes of zeros.
+
+So can ten lines of YAML whose aliases repeat aliases.
+"""
 
 from __future__ import annotations
 
 import bz2
 from collections.abc import Callable
-from functools import cache, partial
+from functools import cache, lru_cache, partial
 from os import fstat
 from types import SimpleNamespace
 from typing import Any, BinaryIO, Self
@@ -15,6 +18,9 @@ import lz4.frame
 from rosbags.rosbag1 import reader as ros1
 from rosbags.rosbag2 import reader as ros2
 from rosbags.rosbag2 import storage_mcap as mcap
+from rosbags.rosbag2 import storage_sqlite3 as sqlite
+
+from slam_graph.settings.bounded_yaml import parse_value
 
 _RATIO = 50
 _LEAST = 2**26
@@ -35,6 +41,29 @@ def bound_unpacking() -> None:
         open=_BoundedFile, decompress=partial(_unpacked, zstd.ZstdDecompressor)
     )
     setattr(ros2, "zstd", bounded)  # noqa: B010 - mypy takes it for a module
+    setattr(ros2, "YAML", _BoundedYaml)  # noqa: B010
+    for module in (ros2, mcap, sqlite):  # how messages were sent is YAML too, and not used
+        setattr(module, "parse_qos", lambda _: [])  # noqa: B010
+
+
+class _BoundedYaml:
+    """The YAML of ``metadata.yaml``; `typ` is there because the reader of bags gives it."""
+
+    def __init__(self, typ: str) -> None: ...
+
+    def load(self, text: str) -> Any:
+        """The value of a text.
+
+        Raises:
+            YamlTextError: if it is not YAML, or nested or repeated beyond all bounds.
+        """
+        return _yaml_value(text)
+
+
+@lru_cache(maxsize=4)
+def _yaml_value(text: str) -> Any:
+    """The value of a text; a bag is opened several times, and nobody changes what it holds."""
+    return parse_value(text)[0]
 
 
 class _BoundedFile:

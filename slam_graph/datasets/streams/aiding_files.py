@@ -54,7 +54,7 @@ _NMEA_QUALITY_SIGMA_M = {"4": 0.02, "5": 0.3}
 """The same of a carrier-phase solution: integers fixed, or not."""
 _VERTICAL = 2.0
 """Heights are so much less accurate."""
-_LARGEST = np.array([90.0, 360.0, 1e6])
+LARGEST_GEODETIC = np.array([90.0, 360.0, 1e6])
 """Latitudes and longitudes (degrees) and heights (m) are no larger."""
 _FARTHEST_M, _LEAST_SIGMA = 1e6, 1e-9
 """Bounds on known poses: coordinates, and standard deviations in m and rad."""
@@ -164,7 +164,7 @@ def fixes_from(
     good = np.isfinite(whole).all(axis=1)
     good &= (np.diagonal(covariances, axis1=1, axis2=2) > 0).all(axis=1)
     if not local:
-        good &= (np.abs(positions) <= _LARGEST).all(axis=1)
+        good &= (np.abs(positions) <= LARGEST_GEODETIC).all(axis=1)
     good = np.asarray(good, np.bool_)
     kept = kept_of(stamps_ns, good, "gnss_dropped", f"{path}: fix", diagnostics)
     stamps_ns, positions, covariances = stamps_ns[kept], positions[kept], covariances[kept]
