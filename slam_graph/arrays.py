@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["BoolArray", "FloatArray", "IntArray", "median", "skew"]
+__all__ = ["BoolArray", "FloatArray", "IntArray", "lengths_of", "median", "skew"]
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -23,6 +23,12 @@ def skew(v: FloatArray) -> FloatArray:
     matrix[..., 2, 1], matrix[..., 0, 2], matrix[..., 1, 0] = x, y, z
     matrix[..., 1, 2], matrix[..., 2, 0], matrix[..., 0, 1] = -x, -y, -z
     return matrix
+
+
+def lengths_of(vectors: FloatArray) -> FloatArray:
+    """Lengths (N,) of vectors (N, k) that a file gave, silently infinite beyond 1e154."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        return np.asarray(np.linalg.norm(vectors, axis=1))
 
 
 def median(values: NDArray[Any]) -> FloatArray:

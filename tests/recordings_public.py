@@ -150,13 +150,14 @@ def write_kitti_odometry(root: Path, frames: int = 6, number: str = "03") -> Pat
     return sequence
 
 
-def write_tum_rgbd(folder: Path, frames: int = 6) -> Path:
+def write_tum_rgbd(folder: Path, frames: int = 6, size: tuple[int, int] = (640, 480)) -> Path:
     for kind in ("rgb", "depth"):
         (folder / kind).mkdir(parents=True)
         lines = [f"# {kind} images", "# file: 'a.bag'", "# timestamp filename"]
         for k in range(frames):
             stamp = f"13050311{k // 30:02d}.{k % 30 * 33333:06d}"
-            shape, kind_of = ((480, 640, 3), np.uint8) if kind == "rgb" else ((480, 640), np.uint16)
+            rows = size[::-1]
+            shape, kind_of = ((*rows, 3), np.uint8) if kind == "rgb" else (rows, np.uint16)
             pixels = np.random.default_rng(k).integers(0, 255, shape, dtype=kind_of)
             if kind == "depth":
                 pixels += 10_000  # about 2 m

@@ -5,6 +5,7 @@
 `SLAM_GRAPH_MUTATIONS=20000` makes a campaign of it, with new mutations each time.
 """
 
+import logging
 import os
 import random
 import shutil
@@ -21,8 +22,15 @@ import numpy as np
 import pytest
 from map_flights import World
 from pose_graphs import laps
-from recordings import CAMERA_YAML, FRAME_PERIOD_NS, START_NS, write_euroc, write_openvins
-from recordings_loose import write_flight_video, write_image_folder, write_video
+from recordings import (
+    CAMERA_YAML,
+    FRAME_PERIOD_NS,
+    SIZE,
+    START_NS,
+    write_euroc,
+    write_openvins,
+)
+from recordings_loose import CHAIN, write_flight_video, write_image_folder, write_video
 from recordings_public import write_kitti_odometry, write_kitti_raw, write_tum_rgbd
 from recordings_ros import BagWriter, write_bag
 
@@ -33,13 +41,17 @@ from slam_graph.datasets.calibration.euroc_calibration import read_body_T_sensor
 from slam_graph.datasets.calibration.kalibr_calibration import read_kalibr, write_kalibr
 from slam_graph.datasets.formats.eqvio import wheel_tracks
 from slam_graph.datasets.groundtruth import read_groundtruth
+from slam_graph.datasets.streams.aiding_files import read_aiding
 from slam_graph.datasets.streams.mask_images import MaskFolder
 from slam_graph.datasets.streams.object_truth import read_object_truth
+from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import SlamGraphError
 from slam_graph.frontend.extraction import camera_mask
 from slam_graph.pose_graph.graph_files import g2o_lines, read_pose_graph
 from slam_graph.results.map_output import load_map, save_map
 from slam_graph.simulation.simulator import simulate
+
+pytestmark = pytest.mark.filterwarnings("error::RuntimeWarning")
 
 CAMPAIGN = int(os.environ.get("SLAM_GRAPH_MUTATIONS", "0"))
 SEED = os.environ.get("SLAM_GRAPH_MUTATIONS_SEED", str(time.time_ns()) if CAMPAIGN else "0")
@@ -111,6 +123,12 @@ def token(content: bytes, at: int) -> tuple[int, int]:
     return begin, end
 
 
+@pytest.fixture(autouse=True)
+def quiet(caplog: pytest.LogCaptureFixture) -> None:
+    """What is dropped and counted is not written down for each of the many files."""
+    caplog.set_level(logging.CRITICAL, logger="slam_graph")
+
+
 def tried(file: Path, read: Callable[[], object]) -> None:
     """Damage a file in many ways, and read it each time.
 
@@ -159,10 +177,21 @@ def read_all(path: Path, **options: Any) -> None:
     """Everything that a run reads of a recording."""
     sequence = open_dataset(path, **options)
     sequence.info()
-    sequence.groundtruth()
-    sequence.initial_state()
-    for _ in sequence.packets():
-        pass
+    truth = sequence.groundtruth()
+    if truth is not None:
+        assert np.all(np.diff(truth.stamps_ns) > 0)
+        assert np.isfinite(truth.positions).all()
+        np.testing.assert_allclose(np.linalg.norm(truth.quaternions, axis=1), 1.0, atol=0.02)
+    start = sequence.initial_state()
+    if start is not None:
+        assert np.isfinite(start.world_T_body.matrix()).all()
+        assert np.isfinite([start.velocity, start.gyro_bias, start.accel_bias]).all()
+    last_ns = None
+    for packet in sequence.packets():
+        assert last_ns is None or packet.frame.stamp_ns > last_ns
+        last_ns = packet.frame.stamp_ns
+        assert np.all(np.diff(packet.imu.stamps_ns) > 0)
+        assert np.isfinite([packet.imu.gyro, packet.imu.accel]).all()
 
 
 @pytest.mark.parametrize(
@@ -253,12 +282,12 @@ def test_eqvio(tmp_path: Path) -> None:
     tried(path, lambda: read_all(path))
 
 
-@pytest.mark.parametrize("name", ["rgb.txt", "accelerometer.txt", "groundtruth.txt"])
+@pytest.mark.parametrize("name", ["rgb.txt", "depth.txt"])
 def test_tum_rgbd(tmp_path: Path, name: str) -> None:
-    folder = write_tum_rgbd(tmp_path / "flight_freiburg1", frames=4)
-    if not (folder / name).is_file():
-        pytest.skip("not in this recording")
-    tried(folder / name, lambda: read_all(folder))
+    folder = write_tum_rgbd(tmp_path / "flight_freiburg1", frames=3, size=SIZE)
+    chain = tmp_path / "chain.yaml"
+    chain.write_text(CHAIN)
+    tried(folder / name, lambda: read_all(folder, calibration=chain))
 
 
 @pytest.mark.parametrize(
@@ -320,17 +349,25 @@ def test_true_poses_of_objects(tmp_path: Path) -> None:
     tried(path, lambda: read_object_truth(path))
 
 
-@pytest.mark.parametrize("name", ["gnss.csv", "odometry.csv", "poses.csv"])
-def test_aiding(tmp_path: Path, name: str) -> None:
-    root = tmp_path / "flight"
+@pytest.fixture(scope="module")
+def aiding(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A recording with position fixes, known poses and odometry."""
+    root = tmp_path_factory.mktemp("aiding") / "flight"
     with_aiding = {
         "gnss": {"sigma_m": 1.0, "rate_hz": 5.0},
         "known_poses": {"rotation_sigma_rad": 0.1},
         "odometry": {"enabled": True},
     }
     simulate(kind="images", duration_s=0.5, rate_hz=4.0, cameras=1, **with_aiding).save(root)
-    file = next(root.rglob(name))
-    tried(file, lambda: read_all(root))
+    return root
+
+
+@pytest.mark.parametrize("name", ["gnss.csv", "odometry.csv", "poses.csv"])
+def test_aiding(aiding: Path, tmp_path: Path, name: str) -> None:
+    folder = write_euroc(tmp_path / "flight", frames=2, cameras=1, imu_lead=4)
+    file = shutil.copy(next(aiding.rglob(name)), folder / name)
+    assert read_aiding([folder], {}, Diagnostics())
+    tried(file, lambda: read_all(folder))
 
 
 def test_maps(tmp_path: Path) -> None:

@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from slam_graph.arrays import FloatArray, IntArray
+from slam_graph.arrays import FloatArray, IntArray, lengths_of
 from slam_graph.datasets.calibration.euroc_calibration import read_body_T_sensor
 from slam_graph.datasets.streams.csv_rows import (
     STAMP_TEXT,
@@ -82,17 +83,35 @@ def read_groundtruth(path: str | Path, diagnostics: Diagnostics | None = None) -
     path = resolve_groundtruth(Path(path))
     check_groundtruth(path)
     diagnostics = diagnostics if diagnostics is not None else Diagnostics()
+    return _to_body(_trajectory(*usable_states(path, _parse_block, diagnostics)), path)
+
+
+def usable_states(
+    path: Path,
+    parse: Callable[[Rows], tuple[IntArray, FloatArray]],
+    diagnostics: Diagnostics,
+) -> tuple[IntArray, FloatArray]:
+    """The states in a file that are finite, have a rotation, and are in the order of time.
+
+    Args:
+        path: of the file.
+        parse: gives stamps (N,) in ns and values (N, 7 or more) of some rows: position, quaternion
+            x y z w, and what else there is.
+        diagnostics: counts the others, as in `read_groundtruth`.
+
+    Raises:
+        DataError: if the file cannot be read, or holds none.
+    """
     blocks = []
     latest_ns = np.iinfo(np.int64).min
     for rows in read_rows(path):
-        stamps, values = _parse_block(rows)
+        stamps, values = parse(rows)
         kept = _usable(rows, stamps, values, latest_ns, diagnostics)
         blocks.append((stamps[kept], values[kept]))
         latest_ns = int(stamps[kept[-1]]) if len(kept) else latest_ns
-    stamps = np.concatenate([b[0] for b in blocks])
-    if len(stamps) == 0:
-        raise DataError(f"{path}: no usable ground truth row in this file")
-    return _to_body(_trajectory(stamps, np.concatenate([b[1] for b in blocks])), path)
+    if not sum(len(stamps) for stamps, _ in blocks):
+        raise DataError(f"{path}: no usable state in this file")
+    return np.concatenate([b[0] for b in blocks]), np.concatenate([b[1] for b in blocks])
 
 
 def _layout(rows: Rows) -> tuple[str | None, int]:
@@ -138,7 +157,8 @@ def _usable(
 ) -> NDArray[np.intp]:
     """Indices of the rows that are finite, have a rotation, and are later than those before."""
     whole = np.isfinite(values).all(axis=1)
-    whole &= np.linalg.norm(values[:, 3:7], axis=1) > _SMALLEST_QUATERNION
+    lengths = lengths_of(values[:, 3:7])
+    whole &= (lengths > _SMALLEST_QUATERNION) & np.isfinite(lengths)
     for k in np.flatnonzero(~whole):
         diagnostics.warn("groundtruth_not_finite", f"{rows.where(int(k))}: row dropped")
     kept = []

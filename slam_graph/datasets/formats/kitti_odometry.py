@@ -62,9 +62,10 @@ class KittiOdometrySequence(ImageSequence):
         self.path = path.resolve()
         self._times_ns = read_seconds(path / "times.txt")
         folders = [folder for k in range(2) if (folder := path / f"image_{k}").is_dir()]
-        kept = increasing(
+        self._kept = increasing(
             self._times_ns, "camera_out_of_order", path / "times.txt", options.diagnostics
-        ).tolist()
+        )
+        kept = self._kept.tolist()
         streams = [
             FileImages(f.name, self._times_ns[kept], [f / f"{k:06d}.png" for k in kept])
             for f in folders
@@ -85,13 +86,12 @@ class KittiOdometrySequence(ImageSequence):
             raise DataError(
                 f"{self._poses}: {len(matrices)} poses, {self.path} has {len(self._times_ns)} times"
             )
-        later = np.diff(self._times_ns, prepend=self._times_ns[0] - 1) > 0
-        poses = _are_poses(matrices)
-        for k in np.flatnonzero(later & ~poses):
+        good = _are_poses(matrices)
+        for k in self._kept[~good[self._kept]]:
             what = f"{self._poses}: row {k + 1} is not a finite pose, dropped"
             self.diagnostics.warn("groundtruth_not_finite", what)
-        kept = later & poses
-        if not kept.any():
+        kept = self._kept[good[self._kept]]
+        if not len(kept):
             raise DataError(f"{self._poses}: no pose of this file can be used")
         rotations = _WORLD_R_CAMERA0 @ matrices[kept, :, :3]
         return Trajectory(

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from slam_graph.datasets.calibration.calibration_yaml import read_yaml
 from slam_graph.datasets.calibration.euroc_calibration import read_camera
 from slam_graph.datasets.calibration.kalibr_calibration import read_kalibr
+from slam_graph.datasets.groundtruth import usable_states
 from slam_graph.datasets.sequence import (
     FrameStream,
     ReaderOptions,
@@ -43,6 +44,7 @@ from slam_graph.datasets.streams.track_frames import (
     TrackTable,
     frames_from_tables,
 )
+from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import DataError
 from slam_graph.geometry import NavState, Trajectory
 from slam_graph.sensors import ImuData, ImuNoise, Rig, RigCamera
@@ -87,17 +89,13 @@ def _read_rig(path: Path) -> Rig:
     return Rig(tuple(cameras), noise)
 
 
-def _read_states(path: Path) -> Trajectory:
+def _read_states(path: Path, diagnostics: Diagnostics) -> Trajectory:
     """States over time: rows of time, position, quaternion x y z w, velocity and biases.
 
     Raises:
-        DataError: if the file is missing or empty, or a row cannot be read.
+        DataError: if the file is missing, a row cannot be read, or none can be used.
     """
-    blocks = [_parse_states(rows) for rows in read_rows(path)]
-    if not blocks:
-        raise DataError(f"{path}: no data rows in this file")
-    stamps = np.concatenate([block[0] for block in blocks])
-    values = np.concatenate([block[1] for block in blocks])
+    stamps, values = usable_states(path, _parse_states, diagnostics)
     return Trajectory(
         stamps,
         values[:, :3].copy(),
@@ -108,13 +106,13 @@ def _read_states(path: Path) -> Trajectory:
     )
 
 
-def _read_start(path: Path) -> NavState:
+def _read_start(path: Path, diagnostics: Diagnostics) -> NavState:
     """The start state, and how well it is known, from ``init_state.csv``.
 
     Raises:
         DataError: if the file cannot be read, or a standard deviation is no positive number.
     """
-    states = _read_states(path)
+    states = _read_states(path, diagnostics)
     assert states.velocities is not None
     assert states.gyro_biases is not None
     assert states.accel_biases is not None
@@ -181,7 +179,7 @@ class OpenvinsSimulation(RecordedSequence):
         rig = _read_rig(path / "calib.yaml") if chain is None else read_kalibr(chain)
         self._known_cameras = len(rig.cameras)
         truth = path / "groundtruth.csv"
-        own = partial(_read_states, truth) if truth.is_file() else None
+        own = partial(_read_states, truth, options.diagnostics) if truth.is_file() else None
         super().__init__(path.resolve().name, options.select(rig), options, own)
         self._tracks, self._imu_file = path / "tracks.csv", path / "imu.csv"
         for file in (self._tracks, self._imu_file):
@@ -214,7 +212,7 @@ class OpenvinsSimulation(RecordedSequence):
     def initial_state(self) -> NavState | None:
         """The start state of ``init_state.csv``, with the covariance that its comment gives."""
         file = self.path / "init_state.csv"
-        return _read_start(file) if file.is_file() else None
+        return _read_start(file, self.diagnostics) if file.is_file() else None
 
     def _tables(self, start_ns: int | None, end_ns: int | None) -> Iterator[TrackTable]:
         for rows in read_rows(self._tracks, _ROWS_PER_TRACK_BLOCK):

@@ -12,7 +12,7 @@ from zipfile import ZipFile
 import gtsam
 import numpy as np
 
-from slam_graph.arrays import FloatArray
+from slam_graph.arrays import FloatArray, lengths_of
 from slam_graph.datasets.calibration.calibration_yaml import pose_from_matrix
 from slam_graph.datasets.formats.recorded_files import AGAIN
 from slam_graph.errors import DataError
@@ -43,7 +43,7 @@ def save_trajectory(path: Path, trajectory: Trajectory) -> None:
 def load_trajectory(path: Path) -> Trajectory:
     """Read what `save_trajectory` wrote."""
     arrays = _load(path, ("stamps_ns", "positions", "quaternions"), _TRAJECTORY_SHAPES)
-    stamps, lengths = arrays["stamps_ns"], np.linalg.norm(arrays["quaternions"], axis=1)
+    stamps, lengths = arrays["stamps_ns"], lengths_of(arrays["quaternions"])
     if np.any(stamps[1:] <= stamps[:-1]) or np.any(np.abs(lengths - 1.0) > _UNIT_TOLERANCE):
         raise DataError(
             f"{path}: the times do not increase, or a quaternion is not of unit length; {AGAIN}"

@@ -13,7 +13,7 @@ import gtsam
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from slam_graph.arrays import FloatArray
+from slam_graph.arrays import FloatArray, lengths_of
 from slam_graph.datasets.rosbag.bag import Bag, Message
 from slam_graph.datasets.rosbag.messages import POSES, pose_of, pose_sigmas_of
 from slam_graph.datasets.rosbag.ros_topics import frame_of, path_between
@@ -165,8 +165,9 @@ class BagAiding:
             if base is None:
                 base = _decoded(message, lambda odometry: str(odometry.child_frame_id), None)
         stamps_ns, poses = np.array(stamps, np.int64), np.array(rows).reshape(-1, 7)
-        lengths = np.linalg.norm(poses[:, 3:], axis=1)
-        good = np.isfinite(poses).all(axis=1) & (lengths >= _SHORTEST_QUATERNION)
+        lengths = lengths_of(poses[:, 3:])
+        good = np.isfinite(poses).all(axis=1) & np.isfinite(lengths)
+        good &= lengths >= _SHORTEST_QUATERNION
         what = f"{self._bag.path}: odometry"
         kept = kept_of(stamps_ns, good, "odometry_dropped", what, self._diagnostics)
         if not len(kept):

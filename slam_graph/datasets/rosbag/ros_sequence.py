@@ -15,6 +15,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from slam_graph.arrays import lengths_of
 from slam_graph.datasets.calibration.kalibr_calibration import read_kalibr
 from slam_graph.datasets.rosbag.bag import REINDEX, Bag, Message
 from slam_graph.datasets.rosbag.messages import image_of, inertial_of, pose_of
@@ -374,7 +375,8 @@ class RosBagSequence(GroupedSequence):
         for message in self._until_damage([topic]):
             stamp_ns = self._stamp_ns(message)
             pose = self._pose(message)
-            if not np.all(np.isfinite(pose)) or np.linalg.norm(pose[3:]) < 0.5:
+            length = float(lengths_of(np.array([pose[3:]]))[0])
+            if not np.isfinite([*pose, length]).all() or length < 0.5:
                 self.diagnostics.warn("groundtruth_not_finite", f"{self._where(message)}: dropped")
             elif stamps and stamp_ns <= stamps[-1]:
                 self.diagnostics.warn(

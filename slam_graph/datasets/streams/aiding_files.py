@@ -27,7 +27,7 @@ from pathlib import Path
 
 import numpy as np
 
-from slam_graph.arrays import BoolArray, FloatArray, IntArray
+from slam_graph.arrays import BoolArray, FloatArray, IntArray, lengths_of
 from slam_graph.datasets.streams.csv_rows import Rows, read_rows
 from slam_graph.datasets.streams.geodesy import Datum, local_positions
 from slam_graph.datasets.streams.pairing import in_order
@@ -264,7 +264,7 @@ def _read_odometry(path: Path, diagnostics: Diagnostics) -> tuple[IntArray, Floa
     if not tables:
         raise DataError(f"{path}: no odometry in this file")
     table = np.concatenate(tables)
-    stamps, lengths = table["stamp"], np.linalg.norm(table["quaternion"], axis=1)
+    stamps, lengths = table["stamp"], lengths_of(table["quaternion"])
     good = np.isfinite(table["position"]).all(axis=1) & (np.abs(lengths - 1.0) < 1e-2)
     table = table[kept_of(stamps, good, "odometry_dropped", f"{path}: odometry", diagnostics)]
     return table["stamp"], table["position"], table["quaternion"]
@@ -315,7 +315,7 @@ def known_poses_from(
     unknown = np.asarray((parts == np.inf).all(axis=2), np.bool_)
     # what was not measured may have any value
     positions[unknown[:, 0]], quaternions[unknown[:, 1]] = 0.0, (0, 0, 0, 1)
-    lengths = np.linalg.norm(quaternions, axis=1)
+    lengths = lengths_of(quaternions)
     good = np.isfinite(positions).all(axis=1) & (np.abs(lengths - 1.0) < 1e-2)
     good &= (measured | unknown).all(axis=1) & measured.any(axis=1)
     good &= (np.abs(positions) <= _FARTHEST_M).all(axis=1)

@@ -117,8 +117,9 @@ class _Judge:
         same = (values[1:] == values[:-1]).all(axis=1)
         moving = ~same[2:]
         if not self.noisy and np.sum(moving) >= _STUCK:
-            first = np.median(np.abs(np.diff(values, axis=0))[2:][moving], axis=0)
-            third = np.median(np.abs(np.diff(values, n=3, axis=0))[moving], axis=0)
+            with np.errstate(over="ignore", invalid="ignore"):  # of samples that are out of range
+                first = np.median(np.abs(np.diff(values, axis=0))[2:][moving], axis=0)
+                third = np.median(np.abs(np.diff(values, n=3, axis=0))[moving], axis=0)
             self.noisy = bool(np.any(third > first))
         if not self.noisy:
             return np.zeros(len(values), bool)

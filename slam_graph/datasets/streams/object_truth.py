@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
+from slam_graph.arrays import lengths_of
 from slam_graph.datasets.streams.csv_rows import LARGEST_STAMP_NS, read_rows
 from slam_graph.errors import DataError
 from slam_graph.geometry import Trajectory
@@ -47,8 +48,7 @@ def read_object_truth(path: Path) -> dict[int, Trajectory]:
     """
     blocks = [rows.parse(_COLUMNS, "true pose of an object") for rows in read_rows(path)]
     table = np.concatenate(blocks) if blocks else np.zeros(0, np.dtype(_COLUMNS))
-    with np.errstate(over="ignore", invalid="ignore"):  # they are judged below
-        lengths = np.linalg.norm(table["q"], axis=1)
+    lengths = lengths_of(table["q"])
     finite = np.isfinite(table["position"]).all() and np.isfinite(lengths).all()
     if not finite or np.any(np.abs(lengths - 1.0) > _UNIT_TOLERANCE):
         raise DataError(f"{path}: a pose is not finite, or a quaternion is not of unit length")
