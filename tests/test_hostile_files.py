@@ -4,17 +4,21 @@
 
 import bz2
 import shutil
+import time
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import get_args
 from zlib import crc32
 
 import numpy as np
 import pytest
-from recordings import write_euroc, write_openvins
+from recordings import edit_text, write_euroc, write_openvins
 from recordings_loose import write_times, write_video
-from recordings_public import write_tum_rgbd
+from recordings_public import write_kitti_odometry, write_tum_rgbd
 from recordings_ros import bag_writer, write_bag
+from rosbags.rosbag1 import Writer
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from typer.testing import CliRunner
 
 from slam_graph.bundle_adjustment.bal_file import read_bal
@@ -27,6 +31,8 @@ from slam_graph.datasets.formats import track_recording as layout
 from slam_graph.datasets.formats import video
 from slam_graph.datasets.groundtruth import read_groundtruth
 from slam_graph.datasets.rosbag import bounded_unpacking
+from slam_graph.datasets.rosbag.bag import Bag
+from slam_graph.datasets.rosbag.messages import IMU
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import ConfigError, DataError, SlamGraphError
 from slam_graph.frontend.extraction import camera_mask
@@ -325,6 +331,85 @@ def test_a_compressed_bag_is_read(tmp_path: Path, name: str) -> None:
     path = write_bag(tmp_path, "ros1", frames=3, packed=name)
     assert name.encode() in path.read_bytes()
     assert open_dataset(path).info().frames == 3
+
+
+def bag_of_type(path: Path, definition: str) -> Path:
+    """A bag with one IMU message, of a type that the bag defines in its own way."""
+    types = get_typestore(Stores.EMPTY)
+    types.register(get_types_from_msg(definition, IMU))
+    text, digest = types.generate_msgdef(IMU)
+    with Writer(path) as writer:
+        connection = writer.add_connection("/imu0", IMU, msgdef=text, md5sum=digest)
+        writer.write(connection, 1, bytes(40))
+    return path
+
+
+@pytest.mark.parametrize(
+    "definition",
+    [
+        "string[300000] names",
+        f"std_msgs/Header[300000] headers\n{'=' * 80}\nMSG: std_msgs/Header\nuint8 sequence",
+        "sensor_msgs/Imu itself",
+        "uint8[4000000000] numbers",
+    ],
+)
+def test_a_type_that_claims_long_arrays_is_refused(tmp_path: Path, definition: str) -> None:
+    """Lines of code would be made and compiled for each element, for minutes."""
+    bag = Bag(bag_of_type(tmp_path / "a.bag", definition))
+    begin_s = time.process_time()
+    with pytest.raises(DataError, match="cannot be read"):
+        next(bag.messages(["/imu0"])).decode(str)
+    assert time.process_time() - begin_s < 2.0
+
+
+@pytest.mark.parametrize("field", [b"angular_velocity", b"encoding", b"frame_id", b"transforms"])
+def test_a_type_with_other_fields_is_damage(tmp_path: Path, field: bytes) -> None:
+    """A bag carries the definitions of its types, and may say anything there."""
+    path = write_bag(tmp_path, "mcap_file", frames=2)
+    path.write_bytes(path.read_bytes().replace(field, field[:-1] + b"x"))
+    with suppress(SlamGraphError):
+        read_all(path)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "reason"),
+    [
+        ("rosbag2_bag", LAYERS + "rosbag2_bag", "aliases repeat"),
+        ("name: /imu0", "name: [/imu0]", "hash|not a text"),
+        ("version: 8", "version: " + "1" * 5000, "not of type int"),
+        ("starting_time:", "starting_time: " + "[" * 1000, "nested deeper"),
+    ],
+)
+def test_metadata_of_a_bag_is_read_within_the_bounds(
+    tmp_path: Path, old: str, new: str, reason: str
+) -> None:
+    path = write_bag(tmp_path, "mcap", frames=2)
+    edit_text(path / "metadata.yaml", old, new)
+    with pytest.raises(DataError, match=reason):
+        read_all(path)
+
+
+def test_poses_that_are_none_are_dropped(tmp_path: Path) -> None:
+    """Ground truth with quaternions of no length, or of 1e200, and without rotations."""
+    folder = write_openvins(tmp_path / "flight")
+    edit_text(folder / "groundtruth.csv", "0,0,0.6,0.8", "0,0,0,1e200")
+    truth = open_dataset(folder).groundtruth()
+    assert truth is not None
+    assert len(truth) == 1
+    edit_text(folder / "init_state.csv", "0,0,0.6,0.8", "0,0,0,0")
+    with pytest.raises(DataError, match="no usable state"):
+        open_dataset(folder).initial_state()
+    drive = write_kitti_odometry(tmp_path / "kitti", frames=4)
+    poses = tmp_path / "kitti" / "poses" / "03.txt"
+    rows = poses.read_text().splitlines()
+    rows[1] = "1e200 " + rows[1].partition(" ")[2]
+    rows[2] = rows[2].replace(rows[2].split()[3], "nan")
+    poses.write_text("\n".join(rows))
+    sequence = open_dataset(drive)
+    truth = sequence.groundtruth()
+    assert truth is not None
+    assert len(truth) == 2
+    assert sequence.diagnostics.counts["groundtruth_not_finite"] == 2
 
 
 def test_a_compressed_problem_unpacks_within_a_bound(tmp_path: Path) -> None:
