@@ -12,6 +12,7 @@ import shutil
 import time
 import traceback
 from collections.abc import Callable
+from dataclasses import replace
 from itertools import islice
 from pathlib import Path
 from resource import RUSAGE_SELF, getrusage
@@ -36,7 +37,7 @@ from recordings_ros import BagWriter, write_bag
 
 from slam_graph.bundle_adjustment.bal_file import read_bal
 from slam_graph.config import load_config
-from slam_graph.datasets import open_dataset
+from slam_graph.datasets import TrackRecorder, open_dataset
 from slam_graph.datasets.calibration.euroc_calibration import read_body_T_sensor
 from slam_graph.datasets.calibration.kalibr_calibration import read_kalibr, write_kalibr
 from slam_graph.datasets.formats.eqvio import wheel_tracks
@@ -49,6 +50,7 @@ from slam_graph.errors import SlamGraphError
 from slam_graph.frontend.extraction import camera_mask
 from slam_graph.pose_graph.graph_files import g2o_lines, read_pose_graph
 from slam_graph.results.map_output import load_map, save_map
+from slam_graph.sensors import FeatureFrame
 from slam_graph.simulation.simulator import simulate
 
 pytestmark = pytest.mark.filterwarnings("error::RuntimeWarning")
@@ -198,7 +200,7 @@ def read_all(path: Path, **options: Any) -> None:
     "name", ["cam0/data.csv", "cam0/sensor.yaml", "imu0/data.csv", "imu0/sensor.yaml"]
 )
 def test_euroc(tmp_path: Path, name: str) -> None:
-    root = write_euroc(tmp_path / "flight", frames=3, imu_lead=4)
+    root = write_euroc(tmp_path / "flight", frames=3, cameras=1, imu_lead=4)
     tried(root / "mav0" / name, lambda: read_all(root))
 
 
@@ -253,7 +255,7 @@ def test_trajectories(tmp_path: Path, separator: str) -> None:
 @pytest.fixture(scope="module")
 def tracks(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("tracks") / "flight"
-    simulate(duration_s=0.6, rate_hz=5.0).save(path)
+    simulate(duration_s=0.6, rate_hz=5.0, cameras=1).save(path)
     return path
 
 
@@ -263,6 +265,17 @@ def tracks(tmp_path_factory: pytest.TempPathFactory) -> Path:
 )
 def test_recordings(tracks: Path, tmp_path: Path, name: str) -> None:
     folder = shutil.copytree(tracks, tmp_path / "flight")
+    tried(folder / name, lambda: read_all(folder))
+
+
+@pytest.mark.parametrize("name", ["labels.bin", "moving.bin", "moving_frames.bin"])
+def test_recordings_of_objects(tmp_path: Path, name: str) -> None:
+    folder = tmp_path / "flight"
+    flight = simulate(duration_s=0.6, rate_hz=5.0, objects={"count": 1, "masks": True})
+    with TrackRecorder(folder, flight.rig) as recorder:
+        for packet in flight.packets():
+            assert isinstance(packet.frame, FeatureFrame)
+            recorder.write(packet.imu, replace(packet.frame, moving=packet.frame.cameras))
     tried(folder / name, lambda: read_all(folder))
 
 
@@ -360,6 +373,26 @@ def aiding(tmp_path_factory: pytest.TempPathFactory) -> Path:
     }
     simulate(kind="images", duration_s=0.5, rate_hz=4.0, cameras=1, **with_aiding).save(root)
     return root
+
+
+GEODETIC = (
+    "#timestamp [ns],latitude [deg],longitude [deg],altitude [m],sigma_east [m],sigma_north [m],"
+    "sigma_up [m]\n# datum: 48.1, 11.5, 500\n"
+    + "".join(f"{START_NS + k * 10**7},48.10{k},11.50{k},52{k}.5,1,1.5,2\n" for k in range(4))
+)
+NMEA = "".join(
+    f"{START_NS + k * 10**7},$GPGGA,12351{k},4807.03{k},N,01131.000,E,4,08,0.9,545.4,M,46.9,M,,\n"
+    for k in range(4)
+)
+
+
+@pytest.mark.parametrize("text", [GEODETIC, NMEA], ids=["geodetic", "nmea"])
+def test_position_fixes(tmp_path: Path, text: str) -> None:
+    (tmp_path / "gnss.csv").write_text(text)
+    diagnostics = Diagnostics()
+    assert len(read_aiding([tmp_path], {}, diagnostics).fix_stamps_ns) == 4
+    assert not diagnostics.counts
+    tried(tmp_path / "gnss.csv", lambda: read_aiding([tmp_path], {}, Diagnostics()))
 
 
 @pytest.mark.parametrize("name", ["gnss.csv", "odometry.csv", "poses.csv"])
