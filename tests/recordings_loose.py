@@ -69,10 +69,10 @@ def write_video(
     return path
 
 
-def write_flight_video(folder: Path) -> Path:
+def write_flight_video(folder: Path, images: list[np.ndarray] | None = None) -> Path:
     """A video with times and an IMU beside it."""
-    path = write_video(folder)
-    write_times(path.with_suffix(".csv"))
+    path = write_video(folder, images=images)
+    write_times(path.with_suffix(".csv"), count=8 if images is None else len(images))
     write_inertial(path.with_suffix(".imu.csv"))
     return path
 

@@ -271,7 +271,7 @@ def test_recordings(tracks: Path, tmp_path: Path, name: str) -> None:
 @pytest.mark.parametrize("name", ["labels.bin", "moving.bin", "moving_frames.bin"])
 def test_recordings_of_objects(tmp_path: Path, name: str) -> None:
     folder = tmp_path / "flight"
-    flight = simulate(duration_s=0.6, rate_hz=5.0, objects={"count": 1, "masks": True})
+    flight = simulate(duration_s=0.6, rate_hz=5.0, cameras=1, objects={"count": 1, "masks": True})
     with TrackRecorder(folder, flight.rig) as recorder:
         for packet in flight.packets():
             assert isinstance(packet.frame, FeatureFrame)
@@ -397,10 +397,9 @@ def test_position_fixes(tmp_path: Path, text: str) -> None:
 
 @pytest.mark.parametrize("name", ["gnss.csv", "odometry.csv", "poses.csv"])
 def test_aiding(aiding: Path, tmp_path: Path, name: str) -> None:
-    folder = write_euroc(tmp_path / "flight", frames=2, cameras=1, imu_lead=4)
-    file = shutil.copy(next(aiding.rglob(name)), folder / name)
-    assert read_aiding([folder], {}, Diagnostics())
-    tried(file, lambda: read_all(folder))
+    file = shutil.copy(next(aiding.rglob(name)), tmp_path / name)
+    assert len(read_aiding([tmp_path], {}, Diagnostics()))
+    tried(file, lambda: read_aiding([tmp_path], {}, Diagnostics()).within(0, None))
 
 
 def test_maps(tmp_path: Path) -> None:
@@ -464,17 +463,21 @@ def test_metadata_of_bags(tmp_path: Path) -> None:
     tried(path / "metadata.yaml", lambda: read_all(path))
 
 
+SHADES = [np.full((48, 64), shade, np.uint8) for shade in (40, 90, 160)]
+"""Pictures that take few bytes in a video."""
+
+
 @pytest.mark.parametrize(
     ("name", "codec"),
     [("flight.mkv", "FFV1"), ("flight.avi", "MJPG"), ("flight.mp4", "mp4v")],
 )
 def test_videos(tmp_path: Path, name: str, codec: str) -> None:
-    shades = [np.full((48, 64), shade, np.uint8) for shade in (40, 90, 160)]
-    path = write_video(tmp_path, name, codec, shades)
+    path = write_video(tmp_path, name, codec, SHADES)
     tried(path, lambda: read_all(path))
 
 
 @pytest.mark.parametrize("name", ["flight.csv", "flight.imu.csv", "flight.yaml"])
 def test_what_lies_beside_a_video(tmp_path: Path, name: str) -> None:
-    path = write_flight_video(tmp_path)
+    path = write_flight_video(tmp_path, SHADES)
+    shorten(path.with_suffix(".imu.csv"), 50)
     tried(tmp_path / name, lambda: read_all(path))
