@@ -33,6 +33,7 @@ from slam_graph.datasets.groundtruth import read_groundtruth
 from slam_graph.datasets.rosbag import bounded_unpacking
 from slam_graph.datasets.rosbag.bag import Bag
 from slam_graph.datasets.rosbag.messages import IMU
+from slam_graph.datasets.streams.aiding_files import read_fixes
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import ConfigError, DataError, SlamGraphError
 from slam_graph.frontend.extraction import camera_mask
@@ -410,6 +411,14 @@ def test_poses_that_are_none_are_dropped(tmp_path: Path) -> None:
     assert truth is not None
     assert len(truth) == 2
     assert sequence.diagnostics.counts["groundtruth_not_finite"] == 2
+
+
+@pytest.mark.parametrize("datum", ["48, 11, -inf", "91, 11, 500", "nan, 11, 500", "48, 11"])
+def test_a_datum_that_is_not_on_the_earth_is_refused(tmp_path: Path, datum: str) -> None:
+    row = "1403636579763555584,48.1,11.5,520,1,1,2"
+    (tmp_path / "gnss.csv").write_text(f"#timestamp,latitude,longitude\n# datum: {datum}\n{row}\n")
+    with pytest.raises(DataError, match=r"gnss\.csv:2: expected '# datum:"):
+        read_fixes(tmp_path / "gnss.csv", Diagnostics())
 
 
 def test_a_compressed_problem_unpacks_within_a_bound(tmp_path: Path) -> None:

@@ -211,9 +211,10 @@ def _header(path: Path) -> tuple[str, Datum | None]:
                     cells = [float(cell) for cell in line[len(_DATUM) :].split(",")]
                 except ValueError:
                     cells = []
-                if len(cells) != 3:
+                if len(cells) != 3 or not np.all(np.abs(cells) <= LARGEST_GEODETIC):
                     raise DataError(
-                        f"{path}:{number + 1}: expected '{_DATUM} latitude, longitude, altitude'"
+                        f"{path}:{number + 1}: expected '{_DATUM} latitude, longitude, altitude', "
+                        "in degrees and m"
                     )
                 datum = cells[0], cells[1], cells[2]
             if "timestamp" in line.lower():
