@@ -14,7 +14,7 @@ from operator import attrgetter
 import numpy as np
 
 from slam_graph.arrays import IntArray
-from slam_graph.backend import Estimator, Innovations
+from slam_graph.backend import ClockChange, Estimator, Innovations
 from slam_graph.config import RunConfig
 from slam_graph.errors import EstimationError
 from slam_graph.geometry import NavState
@@ -54,6 +54,18 @@ class DivergenceError(EstimationError):
 
 class JumpError(DivergenceError):
     """The platform is somewhere else, and the IMU has not measured how it came there."""
+
+
+class ClockError(DivergenceError):
+    """The clock of the IMU has changed, so that the estimate is wrong since then.
+
+    Attributes:
+        good_ns: time until which states are not affected.
+    """
+
+    def __init__(self, change: ClockChange) -> None:
+        super().__init__(change.message)
+        self.good_ns = change.good_ns
 
 
 def check_sane(state: NavState, config: RunConfig) -> None:

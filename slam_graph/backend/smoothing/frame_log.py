@@ -22,8 +22,11 @@ import numpy as np
 from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.backend.depth_camera import with_depth_camera, with_depth_observed
 from slam_graph.backend.dynamics import motionless_samples
+from slam_graph.backend.initialization.clock_monitor import ClockChange
 from slam_graph.backend.smoothing.smoothing_config import FinalBaConfig
 from slam_graph.datasets import TrackRecorder, open_dataset
+from slam_graph.datasets.faults.imu_faults import ImuLate
+from slam_graph.datasets.faults.injection import inject
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.sensors import (
     AidingData,
@@ -58,6 +61,7 @@ class FrameLog:
     Attributes:
         rig: the calibration with which the frames were undistorted.
         observations: number of all of them.
+        clock_changes: of the IMU, which are corrected where samples are read.
         georeferenced: whether the causal estimate is in the world of the position fixes.
         fix_offset_s: added to the times of the fixes, beyond the given offset.
         fix_calibration: lever arm and clock of the fixes, where they are variables.
@@ -82,6 +86,7 @@ class FrameLog:
         self._last_ids = np.zeros(0, np.int64)
         self._aiding: list[AidingData] = []
         self.observations = 0
+        self.clock_changes: tuple[ClockChange, ...] = ()
         self.georeferenced, self.fix_offset_s = False, 0.0
         self.fix_calibration: AidingData.Calibration | None = None
 
@@ -184,6 +189,11 @@ class FrameLog:
     def packets(self, first: int, stop: int, rig: Rig) -> Iterator[Packet]:
         """Frames `first` to `stop - 1`, each with the samples since the one before."""
         sequence = open_dataset(self._path, "recording", diagnostics=_Silent())
+        if self.clock_changes:
+            start_ns = sequence.info().start_ns
+            sequence = inject(
+                sequence, [_undone(change, start_ns) for change in self.clock_changes]
+            )
         sequence.rig = replace(rig, has_imu=True)  # it says how far the samples lead
         yield from sequence.packets(self._frames[first], self._frames[stop - 1])
 
@@ -206,3 +216,14 @@ class FrameLog:
             return True
         common = np.isin(self._last_ids, frame.cameras[0].ids)
         return len(common) > 0 and bool(common.mean() < self._config.min_common_features)
+
+
+def _undone(change: ClockChange, start_ns: int) -> ImuLate:
+    """The fault that undoes a change of the clock of the IMU.
+
+    Args:
+        change: of the clock.
+        start_ns: time of the first frame of the recording.
+    """
+    at_s = max(0.0, (change.since_ns - start_ns) * 1e-9)
+    return ImuLate(at_s=at_s, by_s=-change.shift_s)
