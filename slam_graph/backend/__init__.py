@@ -12,7 +12,6 @@ __all__ = [
     "AlgorithmConfig",
     "Attempt",
     "BackendConfig",
-    "ClockChange",
     "Estimator",
     "FeaturePolicy",
     "FinalBa",
@@ -47,7 +46,6 @@ if TYPE_CHECKING:
     )
     from slam_graph.backend.cost.triangulation import triangulate_frames
     from slam_graph.backend.estimator import Estimator
-    from slam_graph.backend.initialization.clock_monitor import ClockChange
     from slam_graph.backend.initialization.visual_rotation import visual_rotation
     from slam_graph.backend.objects.moving_objects import MovingObjects
     from slam_graph.backend.objects.object_frame import ObjectFrame
@@ -80,7 +78,6 @@ else:
             ),
             "cost.triangulation": ("triangulate_frames",),
             "estimator": ("Estimator",),
-            "initialization.clock_monitor": ("ClockChange",),
             "initialization.visual_rotation": ("visual_rotation",),
             "objects.moving_objects": ("MovingObjects",),
             "objects.object_frame": ("ObjectFrame",),

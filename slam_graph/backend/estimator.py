@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable
+from typing import TypeAlias
 
 import numpy as np
 
@@ -29,7 +30,7 @@ from slam_graph.backend.engine import SquareRootEngine
 from slam_graph.backend.engine_protocol import Engine, EngineContext, StepReport
 from slam_graph.backend.estimator_knowledge import EstimatorKnowledge
 from slam_graph.backend.gtsam_smoothers.smoother_engine import SmootherEngine
-from slam_graph.backend.initialization.clock_monitor import ClockChange
+from slam_graph.backend.initialization import clock_monitor
 from slam_graph.backend.initialization.first_state import start_from
 from slam_graph.backend.initialization.start_calibration import FoundCalibration, StartCalibration
 from slam_graph.backend.initialization.start_up import StartUp
@@ -69,6 +70,8 @@ class Estimator(EstimatorKnowledge):
         clock_changes: all that are corrected in the IMU samples, in their order.
     """
 
+    ClockChange: TypeAlias = clock_monitor.ClockChange
+
     def __init__(
         self,
         rig: Rig,
@@ -89,8 +92,8 @@ class Estimator(EstimatorKnowledge):
         """
         config, diagnostics = config or BackendConfig(), diagnostics or Diagnostics()
         self._real_rig = rig
-        self.clock_change: ClockChange | None = None
-        self.clock_changes: list[ClockChange] = []
+        self.clock_change: clock_monitor.ClockChange | None = None
+        self.clock_changes: list[clock_monitor.ClockChange] = []
         dynamics = self._dynamics = Dynamics.of(with_depth_camera(rig), algorithm, config)
         rig, algorithm, config = dynamics.rig, dynamics.algorithm, dynamics.config
         self._make_engine: Callable[[EngineContext], Engine] = SquareRootEngine

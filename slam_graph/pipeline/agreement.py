@@ -14,7 +14,7 @@ from operator import attrgetter
 import numpy as np
 
 from slam_graph.arrays import IntArray
-from slam_graph.backend import ClockChange, Estimator, Innovations
+from slam_graph.backend import Estimator, Innovations
 from slam_graph.config import RunConfig
 from slam_graph.errors import EstimationError
 from slam_graph.geometry import NavState
@@ -63,7 +63,7 @@ class ClockError(DivergenceError):
         good_ns: time until which states are not affected.
     """
 
-    def __init__(self, change: ClockChange) -> None:
+    def __init__(self, change: Estimator.ClockChange) -> None:
         super().__init__(change.message)
         self.good_ns = change.good_ns
 

@@ -217,7 +217,7 @@ class Estimation:
             raise DivergenceError(
                 f"diverged at frame {stamp_ns}: the equations cannot be solved ({reason})"
             ) from error
-        if estimator.clock_change is not None:
+        if estimator.clock_change is not None and result.config.limits.recovery:
             raise ClockError(estimator.clock_change)
         if estimator.replayed is not None:  # what was said of these frames so far is superseded
             self._recovery.supersede(estimator.replayed)

@@ -26,7 +26,7 @@ from slam_graph.geometry import NavState
 from slam_graph.sensors import AidingData, CameraFrame, FeatureFrame, ImuData, Packet, Rig
 
 if TYPE_CHECKING:
-    from slam_graph.backend import ClockChange, ObjectFrame
+    from slam_graph.backend import Estimator, ObjectFrame
 
 COMPLETED = ("ok", "suspect", "low_coverage")
 """Run statuses after which loops are closed and a map is built (not after Ctrl-C)."""
@@ -83,7 +83,7 @@ class EstimatedFrame:
     objects: ObjectFrame | None = None
     imu_noise_at_limit: bool = False
     recorded_rig: Rig | None = None
-    clock_changes: tuple[ClockChange, ...] = ()
+    clock_changes: tuple[Estimator.ClockChange, ...] = ()
 
     @property
     def image(self) -> np.ndarray | None:
@@ -93,8 +93,11 @@ class EstimatedFrame:
 
     @property
     def imu(self) -> ImuData:
-        """The IMU samples since the frame before."""
-        return self.packet.imu
+        """The IMU samples since the frame before, on the clock of the beginning."""
+        samples = self.packet.imu
+        for change in self.clock_changes:
+            samples = change.corrected(samples)
+        return samples
 
     def feedback(self) -> Feedback:
         """What the front end is told about the features."""

@@ -44,8 +44,8 @@ _AFTER_NS = 100_000_000
 """The new beginning keeps this far from the time of the change."""
 _NEAR_NS = 1_000_000_000
 """A gap in the samples this near to the change is where it happened."""
-_SHARE_OF_GAP = 0.5
-"""Such a gap is at least this part of the change."""
+_SAME_SIGMAS = 3.0
+"""Such a gap is as long as the change if the two differ by fewer standard deviations."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,19 +108,26 @@ class ClockMonitor:
         self._nominal_s = camera.clock_offset_s
         self._known = known
 
-    def watch(self, covered: tuple[Turns, ImuData], imu: ImuBuffer) -> ClockChange | None:
-        """Look at the rotations of the last seconds.
+    def suspects(self, turns: Turns, imu: ImuData) -> bool:
+        """Whether rotations need a closer look: they show another offset, or none is known yet.
 
         Args:
-            covered: the rotations, and samples that cover them.
+            turns: a few rotations over the last seconds.
+            imu: samples that cover them.
+        """
+        if self._known is None:
+            return True
+        offset_s, sigma_s = self._known
+        step_s, step_sigma_s = offset_step(turns, imu, self._R, offset_s)
+        return abs(step_s) > _SUSPECT_SIGMAS * float(np.hypot(step_sigma_s, sigma_s))
+
+    def look(self, covered: tuple[Turns, ImuData], imu: ImuBuffer) -> ClockChange | None:
+        """Find the offset of the last seconds, and the change if it contradicts what was known.
+
+        Args:
+            covered: rotations as close together as at the start, and samples that cover them.
             imu: all recent samples.
         """
-        offset_s, sigma_s = (self._nominal_s, 0.0) if self._known is None else self._known
-        step_s, step_sigma_s = offset_step(*covered, self._R, offset_s)
-        if self._known is not None and (
-            abs(step_s) < _SUSPECT_SIGMAS * float(np.hypot(step_sigma_s, sigma_s))
-        ):
-            return None
         found = align_gyroscope(*covered, self._R, self._nominal_s)
         return None if found is None else self.judge(found, covered, imu)
 
@@ -174,21 +181,37 @@ def _change(
     after = turns.first_ns >= first_ns
     if np.count_nonzero(after) >= _FEWEST_AFTER:
         found = align_gyroscope(turns.select(after), samples, R, before_s) or found
-    shift_s = found.offset_s - before_s
+    change_s, sigma_s = found.offset_s - before_s, found.offset_sigma_s
     before_ns = round(before_s * 1e9)
-    since_ns = _since(imu.data, first_ns + before_ns, shift_s)
-    return ClockChange(
-        since_ns, good_ns + before_ns, first_ns + _AFTER_NS, shift_s, found.offset_sigma_s
-    )
+    gap = _gap(imu.data, first_ns + before_ns, change_s, sigma_s)
+    since_ns, shift_s, sigma_s = gap or (first_ns + before_ns, change_s, sigma_s)
+    return ClockChange(since_ns, good_ns + before_ns, first_ns + _AFTER_NS, shift_s, sigma_s)
 
 
-def _since(imu: ImuData, near_ns: int, shift_s: float) -> int:
-    """Stamp of the first sample on the new clock: after a gap, or where the rotations say."""
+def _gap(
+    imu: ImuData, near_ns: int, change_s: float, sigma_s: float
+) -> tuple[int, float, float] | None:
+    """The gap that a later clock leaves in the stamps: it is as long as the change.
+
+    Args:
+        imu: samples.
+        near_ns: about when the clock has changed.
+        change_s: by how much.
+        sigma_s: standard deviation of that.
+
+    Returns:
+        Stamp of the first sample after the gap, how much longer than usual it is, and how much
+        intervals differ (s); None if there is no such gap.
+    """
     stamps = imu.stamps_ns
     around = stamps[(stamps > near_ns - _NEAR_NS) & (stamps < near_ns + _NEAR_NS)]
-    if len(around) > 1:
-        gaps = np.diff(around)
-        largest = int(np.argmax(gaps))
-        if gaps[largest] - float(np.median(gaps)) > _SHARE_OF_GAP * shift_s * 1e9 > 0.0:
-            return int(around[largest + 1])
-    return near_ns
+    if len(around) < 2:
+        return None
+    intervals_s = np.diff(around) * 1e-9
+    usual_s = float(np.median(intervals_s))
+    largest = int(np.argmax(intervals_s))
+    longer_s = float(intervals_s[largest]) - usual_s
+    if longer_s < usual_s or abs(longer_s - change_s) > _SAME_SIGMAS * sigma_s:
+        return None
+    jitter_s = float(np.median(np.abs(intervals_s - usual_s)))
+    return int(around[largest + 1]), longer_s, jitter_s

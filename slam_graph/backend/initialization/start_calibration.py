@@ -25,10 +25,12 @@ from slam_graph.backend.initialization.gyro_alignment import (
 from slam_graph.backend.initialization.visual_turns import VisualTurns
 from slam_graph.sensors import FeatureFrame, ImuBuffer, Rig
 
-_SPACING_NS, _LATER_SPACING_NS = 45_000_000, 180_000_000
+_SPACING_NS, _LATER_SPACING_NS = 45_000_000, 360_000_000
 """Smallest time between two frames that are used, at the start and later."""
-_RETRY_NS = 400_000_000
-"""Time between two estimates."""
+_LATER_TURNS = 10
+"""Fewest rotations for a look at the clock later."""
+_RETRY_NS, _LATER_RETRY_NS, _LATER_PAUSE_NS = 400_000_000, 900_000_000, 5_000_000_000
+"""Time between two estimates at the start, two looks at the clock later, and after a close one."""
 _RECENT_NS = 6_000_000_000
 """How long frames are kept to begin anew from."""
 _CLEAR, _CLEAR_WAITING = 30.0, 15.0
@@ -87,7 +89,7 @@ class StartCalibration:
         self.mounted = self._camera.rotation_known
         self.recent: deque[FeatureFrame] = deque()
         self._turns = VisualTurns(self._camera, config.noise.pixel_sigma)
-        self._tried_ns = 0
+        self._next_ns = 0
         self._checks = config.initialization.check_calibration
         self._monitor = ClockMonitor(self._camera) if self.mounted else None
         self.done = not self._checks and self.mounted
@@ -117,15 +119,14 @@ class StartCalibration:
         self.recent.append(frame)
         while frame.stamp_ns - self.recent[0].stamp_ns > _RECENT_NS:
             self.recent.popleft()
-        spacing_ns = _LATER_SPACING_NS if self.done else _SPACING_NS
-        self._turns.add(frame, imu, self.mounted, spacing_ns)
-        if frame.stamp_ns - self._tried_ns < _RETRY_NS:
-            return None
-        self._tried_ns = frame.stamp_ns
-        covered = self._turns.covered(imu)
         monitor = self._monitor if started else None
         if self.done:
-            return None if covered is None or monitor is None else monitor.watch(covered, imu)
+            return self._watch(frame, imu, monitor)
+        self._turns.add(frame, imu, self.mounted, _SPACING_NS)
+        if frame.stamp_ns < self._next_ns:
+            return None
+        self._next_ns = frame.stamp_ns + _RETRY_NS
+        covered = self._turns.covered(imu)
         self.done = self._turns.seen > _GIVE_UP_TURNS and self.mounted and started
         if covered is None:
             return None
@@ -136,6 +137,24 @@ class StartCalibration:
             return None
         change = None if monitor is None else monitor.judge(found, covered, imu)
         return change or self._judged(found, _ADOPTED_SIGMA_S if started else _WAITING_SIGMA_S)
+
+    def _watch(
+        self, frame: FeatureFrame, imu: ImuBuffer, monitor: ClockMonitor | None
+    ) -> ClockChange | None:
+        """A change of the clock since the start; few rotations tell whether to look closely."""
+        self._turns.add(frame, imu, self.mounted, _LATER_SPACING_NS)
+        if monitor is None or frame.stamp_ns < self._next_ns:
+            return None
+        self._next_ns = frame.stamp_ns + _LATER_RETRY_NS
+        covered = self._turns.covered(imu, _LATER_TURNS)
+        if covered is None or not monitor.suspects(*covered):
+            return None
+        self._next_ns = frame.stamp_ns + _LATER_PAUSE_NS
+        turns = VisualTurns(self._camera, self._config.noise.pixel_sigma)
+        for before in self.recent:
+            turns.add(before, imu, self.mounted, _SPACING_NS)
+        covered = turns.covered(imu)
+        return None if covered is None else monitor.look(covered, imu)
 
     def contradiction(self, imu: ImuBuffer) -> str | None:
         """What of mounting or units the rotations of the last seconds contradict, if anything."""

@@ -23,7 +23,7 @@ _WINDOW_NS = 5_000_000_000
 """Over this time bias and offset are taken to be constant."""
 _SHORTEST_TREND_S = 0.02
 """The motion within a frame is a line fitted to the gyroscope over the readout, or over this."""
-_MIN_TURNS = 15
+MIN_TURNS = 15
 """Fewest rotations for an estimate."""
 
 
@@ -108,14 +108,14 @@ class VisualTurns:
         vector = Rotation.from_matrix(R).as_rotvec() * ratio
         return np.asarray(Rotation.from_rotvec(vector).as_matrix())
 
-    def covered(self, imu: ImuBuffer) -> tuple[Turns, ImuData] | None:
+    def covered(self, imu: ImuBuffer, fewest: int = MIN_TURNS) -> tuple[Turns, ImuData] | None:
         """The turns that the gyroscope covers, and its samples; None if they are too few."""
         nominal_ns = round(self._camera.clock_offset_s * 1e9)
         around_ns = round(MAX_OFFSET_S * 1e9) + 10_000_000
         newest_ns = imu.newest_ns() - nominal_ns - around_ns
         rows = [t for t in self._turns if t[1] <= newest_ns]
         rows = [t for t in rows if imu.covers(t[0] + nominal_ns - around_ns)]
-        if len(rows) < _MIN_TURNS:
+        if len(rows) < fewest:
             return None
         turns = Turns(
             np.array([t[0] for t in rows]),

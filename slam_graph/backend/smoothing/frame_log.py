@@ -25,8 +25,6 @@ from slam_graph.backend.dynamics import motionless_samples
 from slam_graph.backend.initialization.clock_monitor import ClockChange
 from slam_graph.backend.smoothing.smoothing_config import FinalBaConfig
 from slam_graph.datasets import TrackRecorder, open_dataset
-from slam_graph.datasets.faults.imu_faults import ImuLate
-from slam_graph.datasets.faults.injection import inject
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.sensors import (
     AidingData,
@@ -80,6 +78,7 @@ class FrameLog:
         self._frames = array("q")
         self._keyframes = array("q")  # numbers of frames
         self._noise = array("d")
+        self._first_ns = 0
         self._lead_ns = round(rig.end_offset_s * 1e9)
         self._imu: list[ImuData] = []
         self._imu_ns: tuple[int, int] | None = None
@@ -144,6 +143,8 @@ class FrameLog:
         if self._is_keyframe(frame):
             self._keyframes.append(len(self._frames))
             self._last_ids = cameras[0].ids
+        if not self._frames:
+            self._first_ns = frame.stamp_ns
         self._frames.append(frame.stamp_ns)
         self._noise.extend(noise)
 
@@ -188,12 +189,13 @@ class FrameLog:
 
     def packets(self, first: int, stop: int, rig: Rig) -> Iterator[Packet]:
         """Frames `first` to `stop - 1`, each with the samples since the one before."""
-        sequence = open_dataset(self._path, "recording", diagnostics=_Silent())
-        if self.clock_changes:
-            start_ns = sequence.info().start_ns
-            sequence = inject(
-                sequence, [_undone(change, start_ns) for change in self.clock_changes]
-            )
+        # a change of the clock is undone by the fault that is its opposite
+        undone = [
+            f"imu_late:at_s={(change.since_ns - self._first_ns) * 1e-9!r},by_s={-change.shift_s!r}"
+            for change in self.clock_changes
+        ]
+        silent = _Silent()
+        sequence = open_dataset(self._path, "recording", diagnostics=silent, faults=undone)
         sequence.rig = replace(rig, has_imu=True)  # it says how far the samples lead
         yield from sequence.packets(self._frames[first], self._frames[stop - 1])
 
@@ -216,14 +218,3 @@ class FrameLog:
             return True
         common = np.isin(self._last_ids, frame.cameras[0].ids)
         return len(common) > 0 and bool(common.mean() < self._config.min_common_features)
-
-
-def _undone(change: ClockChange, start_ns: int) -> ImuLate:
-    """The fault that undoes a change of the clock of the IMU.
-
-    Args:
-        change: of the clock.
-        start_ns: time of the first frame of the recording.
-    """
-    at_s = max(0.0, (change.since_ns - start_ns) * 1e-9)
-    return ImuLate(at_s=at_s, by_s=-change.shift_s)
