@@ -176,8 +176,8 @@ class InitializationConfig(Settings):
 
     check_calibration: bool = expert(True)
     """Compare the camera's rotation with the gyroscope in the first motion, and take over a
-    camera-IMU time offset (up to 0.12 s) that clearly contradicts the calibration. Switch it off to
-    believe the calibration whatever the data say."""
+    camera-IMU time offset (up to 0.12 s) that clearly contradicts the calibration; later, correct
+    a clock that changes. Switch it off to believe the calibration whatever the data say."""
 
     moved: ClassVar[Mapping[str, str]] = {
         name: f"is a constant now: {constant} in backend/initialization/{file}.py"

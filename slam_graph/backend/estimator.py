@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable
+from typing import TypeAlias
 
 import numpy as np
 
@@ -29,8 +30,8 @@ from slam_graph.backend.engine import SquareRootEngine
 from slam_graph.backend.engine_protocol import Engine, EngineContext, StepReport
 from slam_graph.backend.estimator_knowledge import EstimatorKnowledge
 from slam_graph.backend.gtsam_smoothers.smoother_engine import SmootherEngine
+from slam_graph.backend.initialization import clock_monitor
 from slam_graph.backend.initialization.first_state import start_from
-from slam_graph.backend.initialization.segment_joint import SegmentJoint
 from slam_graph.backend.initialization.start_calibration import FoundCalibration, StartCalibration
 from slam_graph.backend.initialization.start_up import StartUp
 from slam_graph.backend.online_calibration import MAX_EARLY_NS, CalibrationVariables
@@ -40,7 +41,7 @@ from slam_graph.backend.window import Window
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import EstimationError
 from slam_graph.geometry import NavState
-from slam_graph.sensors import CalibrationEstimate, FeatureFrame, ImuBuffer, ImuData, Rig
+from slam_graph.sensors import FeatureFrame, ImuBuffer, ImuData, Rig
 
 _IMU_HISTORY_NS = 10_000_000_000
 """How long IMU samples are kept."""
@@ -65,7 +66,11 @@ class Estimator(EstimatorKnowledge):
         solved_ns: stamp of the last frame that was taken, on the clock of the cameras.
         report: what is known of the last step besides the state.
         aiding: takes position fixes and odometry up to the next frame.
+        clock_change: found at the last frame: the state is wrong since then; see `begin_segment`.
+        clock_changes: all that are corrected in the IMU samples, in their order.
     """
+
+    ClockChange: TypeAlias = clock_monitor.ClockChange
 
     def __init__(
         self,
@@ -87,6 +92,8 @@ class Estimator(EstimatorKnowledge):
         """
         config, diagnostics = config or BackendConfig(), diagnostics or Diagnostics()
         self._real_rig = rig
+        self.clock_change: clock_monitor.ClockChange | None = None
+        self.clock_changes: list[clock_monitor.ClockChange] = []
         dynamics = self._dynamics = Dynamics.of(with_depth_camera(rig), algorithm, config)
         rig, algorithm, config = dynamics.rig, dynamics.algorithm, dynamics.config
         self._make_engine: Callable[[EngineContext], Engine] = SquareRootEngine
@@ -98,6 +105,7 @@ class Estimator(EstimatorKnowledge):
         self._before: NavState | None = None
         self._measured = True
         self._held: deque[FeatureFrame] | None = None
+        self._corrected = False
         self._output_ns = np.iinfo(np.int64).min
         self.report = StepReport()
         self._single_thread = SingleThread()
@@ -150,21 +158,35 @@ class Estimator(EstimatorKnowledge):
     def begin_segment(self, before: NavState | None, measured: bool = True) -> None:
         """Forget the state, which is lost, and start again with the frames that follow.
 
+        After a change of the clock, samples since then are put on the old clock, and the frames
+        since then are taken again; `states` has what they led to.
+
         Args:
             before: the last good state; the new start is put where the IMU predicts it from there.
             measured: whether the IMU has measured what happened since.
         """
         self._given, self._start_mode = None, "auto"
         self._before, self._measured = before, measured
+        change, self.clock_change = self.clock_change, None
+        frames = [] if change is None else change.after(self._check.recent)
+        self._check.forget()
+        imu, self.states = self._context.imu, []
+        if change is not None:
+            self.clock_changes.append(change)
+            imu.data = change.corrected(imu.data)
+            self._held = self._held or deque()
+        self._begin(imu)
         if self._held is not None:
             self._held.clear()
-        self._check.forget()
-        self._begin(self._context.imu)
+            self._held.extend(frames)
+            self.states = self._take_held(self._held)
 
     def add_imu(self, imu: ImuData) -> None:
         """Add IMU samples that follow those already given; others are counted and left out."""
         if not self.rig.has_imu:  # they mean nothing
             return
+        for change in self.clock_changes:
+            imu = change.corrected(imu)
         left_out = self._context.imu.add(imu)
         if left_out:
             message = f"{left_out} IMU samples are not finite or not in order"
@@ -192,7 +214,7 @@ class Estimator(EstimatorKnowledge):
             has all that were found.
         """
         with self._single_thread.held():
-            self.replayed = None
+            self.replayed, self.clock_change = None, None
             if self._held is None:
                 state = self._take(frame)
                 if self.replayed is None:
@@ -241,8 +263,9 @@ class Estimator(EstimatorKnowledge):
         if bad:
             self.diagnostics.warn("feature_not_finite", f"{bad} of them at {frame.stamp_ns} ns")
         found = self._check.add(frame, imu, self.window is not None)
-        if found is not None:
+        if isinstance(found, FoundCalibration):
             return self._begin_anew(found)
+        self.clock_change = found or self.clock_change
         self._context.propagation.noise.watch_vibration(imu, stamp_ns)
         still, whole = self._standstill.is_still(imu, stamp_ns, frame), frame
         frame = frame.without(self._standstill.dynamic)
@@ -260,7 +283,7 @@ class Estimator(EstimatorKnowledge):
     def _begin_anew(self, found: FoundCalibration) -> NavState | None:
         """Start again with another calibration, from the frames of the last seconds."""
         self.diagnostics.warn("calibration_corrected", found.message)
-        self.rig = found.rig
+        self.rig, self._corrected = found.rig, True
         if self.algorithm.engine == "square_root":  # GTSAM's smoothers take it as it is
             self._variables = found.variables
         given, frames = self._given, list(self._check.recent)
@@ -270,6 +293,7 @@ class Estimator(EstimatorKnowledge):
         if self.window is not None:
             self._output_ns = self.window.stamp_ns
         for rounds_left in reversed(range(_ROUNDS)):
+            self._check.forget()
             self._begin(self._context.imu)
             if given is not None:
                 self.start(given)
@@ -346,11 +370,6 @@ class Estimator(EstimatorKnowledge):
     # --- output ----------------------------------------------------------------------------------
 
     @property
-    def joint(self) -> SegmentJoint | None:
-        """How the present segment continues the one before; None in the first."""
-        return self._start_up.joint
-
-    @property
     def initialized(self) -> bool:
         """Whether there is a state."""
         return self.window is not None
@@ -359,11 +378,6 @@ class Estimator(EstimatorKnowledge):
     def start_is_given(self) -> bool:
         """Whether the first state was given, by `start`."""
         return self._given is not None
-
-    @property
-    def corrected_rig(self) -> Rig | None:
-        """The rig, if the first motion has shown that its calibration does not fit; else None."""
-        return None if self._held is None else self.rig.select(len(self._real_rig.cameras))
 
     @property
     def waiting_for(self) -> str:
@@ -381,17 +395,3 @@ class Estimator(EstimatorKnowledge):
     def dynamic(self) -> IntArray:
         """Ids (N,) of the tracked features that move by themselves, ascending."""
         return self._standstill.dynamic
-
-    @property
-    def imu_noise(self) -> tuple[float, float]:
-        """Factors on the white noise of gyroscope and accelerometer that are assumed now."""
-        return self._context.propagation.noise.factors
-
-    @property
-    def calibration(self) -> CalibrationEstimate | None:
-        """The calibration now; None if nothing of it is estimated, or there is no state yet."""
-        variables = self._context.calibration
-        if self.window is None or not variables.keys:
-            return None
-        information = self._engine.information(self.window)
-        return variables.estimate(self.window.stamp_ns, self.window.state, information)

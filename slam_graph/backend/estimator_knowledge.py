@@ -14,12 +14,14 @@ from slam_graph.backend.aiding.aiding_factors import Aiding
 from slam_graph.backend.backend_config import BackendConfig
 from slam_graph.backend.cost.track_fit import TrackFit
 from slam_graph.backend.engine_protocol import Engine, EngineContext
+from slam_graph.backend.initialization.clock_monitor import ClockChange
+from slam_graph.backend.initialization.segment_joint import SegmentJoint
 from slam_graph.backend.initialization.start_up import StartUp
 from slam_graph.backend.solve.state import FrameMotion
 from slam_graph.backend.window import Window
 from slam_graph.backend.window_graph import WindowGraph
 from slam_graph.errors import EstimationError
-from slam_graph.sensors import AidingData, Rig
+from slam_graph.sensors import AidingData, CalibrationEstimate, Rig
 
 
 class EstimatorKnowledge:
@@ -28,10 +30,16 @@ class EstimatorKnowledge:
     Attributes:
         window: the variables and what is known of them; None as long as there is no state.
         aiding: takes position fixes and odometry up to the next frame.
+        rig: the sensors, as calibrated or corrected at the start.
+        clock_changes: all that are corrected in the IMU samples, in their order.
     """
 
     window: Window | None
     aiding: Aiding
+    rig: Rig
+    clock_changes: list[ClockChange]
+    _real_rig: Rig
+    _corrected: bool
     _engine: Engine
     _context: EngineContext
     _start_up: StartUp
@@ -81,6 +89,11 @@ class EstimatorKnowledge:
         return TrackFit(config.noise.pixel_sigma)
 
     @property
+    def joint(self) -> SegmentJoint | None:
+        """How the present segment continues the one before; None in the first."""
+        return self._start_up.joint
+
+    @property
     def start_is_doubtful(self) -> bool:
         """Whether what follows the start may still contradict it."""
         return self._start_up.doubtful
@@ -89,6 +102,11 @@ class EstimatorKnowledge:
     def assumed_noise_px(self) -> float:
         """Largest standard deviation of observations over the cameras, as the cost takes it."""
         return float(np.max(self._context.pixels.sigma_px))
+
+    @property
+    def imu_noise(self) -> tuple[float, float]:
+        """Factors on the white noise of gyroscope and accelerometer that are assumed now."""
+        return self._context.propagation.noise.factors
 
     @property
     def imu_noise_at_limit(self) -> bool:
@@ -108,6 +126,27 @@ class EstimatorKnowledge:
         if self.window is None or not variables.keys:
             return variables.nominal
         return variables.rig(self.window.state.frames)
+
+    @property
+    def calibration(self) -> CalibrationEstimate | None:
+        """The calibration now; None if nothing of it is estimated, or there is no state yet."""
+        variables = self._context.calibration
+        if self.window is None or not variables.keys:
+            return None
+        information = self._engine.information(self.window)
+        return variables.estimate(self.window.stamp_ns, self.window.state, information)
+
+    @property
+    def corrected_rig(self) -> Rig | None:
+        """The rig, if the first motion has shown that its calibration does not fit; else None."""
+        return self.rig.select(len(self._real_rig.cameras)) if self._corrected else None
+
+    @property
+    def recorded_rig(self) -> Rig | None:
+        """The corrected rig on the clock of the IMU samples as they come; None if nothing is."""
+        shift_s = sum(change.shift_s for change in self.clock_changes)
+        rig = self.rig.select(len(self._real_rig.cameras))
+        return rig.shifted(shift_s) if shift_s else self.corrected_rig
 
     @property
     def fix_calibration(self) -> AidingData.Calibration | None:

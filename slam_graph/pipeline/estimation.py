@@ -15,7 +15,7 @@ from slam_graph.backend import Estimator
 from slam_graph.datasets import Sequence
 from slam_graph.errors import DataError
 from slam_graph.geometry import NavState, Trajectory, interpolate
-from slam_graph.pipeline.agreement import DivergenceError, check_sane
+from slam_graph.pipeline.agreement import ClockError, DivergenceError, check_sane
 from slam_graph.pipeline.recovery import Recovery
 from slam_graph.pipeline.stage import EstimatedFrame
 from slam_graph.pipeline.tracking import TrackedPacket
@@ -168,6 +168,8 @@ class Estimation:
             estimator.aiding.offset_s,
             self._result.fix_calibration,
             imu_noise_at_limit=estimator.imu_noise_at_limit,
+            recorded_rig=estimator.recorded_rig,
+            clock_changes=tuple(estimator.clock_changes),
         )
         self._note(frame, tracked)
         return frame
@@ -215,6 +217,8 @@ class Estimation:
             raise DivergenceError(
                 f"diverged at frame {stamp_ns}: the equations cannot be solved ({reason})"
             ) from error
+        if estimator.clock_change is not None and result.config.limits.recovery:
+            raise ClockError(estimator.clock_change)
         if estimator.replayed is not None:  # what was said of these frames so far is superseded
             self._recovery.supersede(estimator.replayed)
             result.corrected_rig = estimator.corrected_rig

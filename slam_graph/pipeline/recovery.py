@@ -14,7 +14,7 @@ from itertools import pairwise
 from slam_graph.backend import Estimator
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.geometry import NavState
-from slam_graph.pipeline.agreement import Agreement, DivergenceError, JumpError
+from slam_graph.pipeline.agreement import Agreement, ClockError, DivergenceError, JumpError
 from slam_graph.results import RunResult
 from slam_graph.sensors import ImuData
 
@@ -105,7 +105,7 @@ class Recovery:
             DivergenceError: the same, if a new start has no prospect or is not wanted.
         """
         result = self._result
-        good_ns = self._good_until()
+        good_ns = self._good_until(lost)
         if good_ns is not None:
             result.segments.losses.append((good_ns, noticed_ns))
         if not result.config.limits.recovery:
@@ -121,10 +121,13 @@ class Recovery:
         self._agreement = Agreement(result.config)
         self._estimator.begin_segment(before, measured=not isinstance(lost, JumpError))
         self._diagnostics.warn("new_segment", f"{lost}; the run starts again from here")
+        self.append(self._estimator.states)
 
-    def _good_until(self) -> int | None:
+    def _good_until(self, lost: DivergenceError) -> int | None:
         """Until when the states of the present segment are good; None if none is."""
         segments, agreed_ns = self._result.segments, self._agreement.agreed_until()
+        if isinstance(lost, ClockError):
+            agreed_ns = lost.good_ns
         if not segments.goes_on or agreed_ns is None:
             return None
         good_ns = agreed_ns - _MARGIN_NS

@@ -26,7 +26,7 @@ from slam_graph.geometry import NavState
 from slam_graph.sensors import AidingData, CameraFrame, FeatureFrame, ImuData, Packet, Rig
 
 if TYPE_CHECKING:
-    from slam_graph.backend import ObjectFrame
+    from slam_graph.backend import Estimator, ObjectFrame
 
 COMPLETED = ("ok", "suspect", "low_coverage")
 """Run statuses after which loops are closed and a map is built (not after Ctrl-C)."""
@@ -60,6 +60,8 @@ class EstimatedFrame:
         fix_calibration: lever arm and clock of the fixes, where they are estimated with the states.
         objects: what moves; None where moving objects are not estimated.
         imu_noise_at_limit: whether a noise density of the IMU was raised as far as it may be.
+        recorded_rig: the same calibration on the clock that the IMU samples of packets have now.
+        clock_changes: of that clock so far; states are on the clock of the beginning.
     """
 
     packet: Packet
@@ -80,6 +82,8 @@ class EstimatedFrame:
     fix_calibration: AidingData.Calibration | None = None
     objects: ObjectFrame | None = None
     imu_noise_at_limit: bool = False
+    recorded_rig: Rig | None = None
+    clock_changes: tuple[Estimator.ClockChange, ...] = ()
 
     @property
     def image(self) -> np.ndarray | None:
@@ -89,13 +93,16 @@ class EstimatedFrame:
 
     @property
     def imu(self) -> ImuData:
-        """The IMU samples since the frame before."""
-        return self.packet.imu
+        """The IMU samples since the frame before, on the clock of the beginning."""
+        samples = self.packet.imu
+        for change in self.clock_changes:
+            samples = change.corrected(samples)
+        return samples
 
     def feedback(self) -> Feedback:
         """What the front end is told about the features."""
         return Feedback.of(
-            self.state, self.rejected, self.landmark_ids, self.landmarks, self.corrected_rig
+            self.state, self.rejected, self.landmark_ids, self.landmarks, self.recorded_rig
         )
 
 

@@ -195,6 +195,12 @@ class Rig:
         depth = self.depth if self.depth is None or self.depth.camera < count else None
         return replace(self, cameras=self.cameras[:count], depth=depth)
 
+    def shifted(self, shift_s: float) -> Rig:
+        """The same rig if the clock of the IMU were later by some seconds."""
+        offsets_s = [mounted.time_offset_s + shift_s for mounted in self.cameras]
+        cameras = zip(self.cameras, offsets_s, strict=True)
+        return replace(self, cameras=tuple(replace(m, time_offset_s=s) for m, s in cameras))
+
     def without_imu(self) -> Rig:
         """The same rig without its IMU; the body frame stays where it is."""
         cameras = tuple(replace(mounted, rotation_known=True) for mounted in self.cameras)

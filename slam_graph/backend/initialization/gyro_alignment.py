@@ -20,7 +20,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from slam_graph.arrays import FloatArray, IntArray, median, skew
+from slam_graph.arrays import BoolArray, FloatArray, IntArray, median, skew
 from slam_graph.sensors import ImuData
 
 MAX_OFFSET_S = 0.12
@@ -62,6 +62,12 @@ class Turns:
     second_ns: IntArray
     R: FloatArray
     information: FloatArray
+
+    def select(self, rows: BoolArray) -> Turns:
+        """Those of some rows (K,)."""
+        return Turns(
+            self.first_ns[rows], self.second_ns[rows], self.R[rows], self.information[rows]
+        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -247,6 +253,59 @@ def align_gyroscope(
         rotation_sigma,
         scale,
     )
+
+
+def offset_step(
+    turns: Turns, imu: ImuData, body_R_camera: FloatArray, offset_s: float
+) -> tuple[float, float]:
+    """How far the time offset is from a value near by, and its standard deviation, in seconds.
+
+    One Gauss-Newton step of bias and offset: a tenth of the work of `align_gyroscope`, which is to
+    follow where the step is large.
+
+    Args:
+        turns: rotations of the camera.
+        imu: samples that cover them.
+        body_R_camera: (3, 3) mounting.
+        offset_s: the value, t_imu - t_camera.
+    """
+    problem = _Problem(turns, imu)
+    around = problem.body_turns(offset_s + _COARSE_S * np.array([0.0, -1.0, 1.0]))
+    r, J = problem.linearized(around, body_R_camera, free=False)
+    by_offset = (r[2] - r[1]) / (2.0 * _COARSE_S)
+    J = np.concatenate([J[0], by_offset[..., None]], axis=-1)[None]
+    _, x, H, scale = _robust_least_squares(r[:1], J, None)
+    variance = float(np.linalg.inv(H[0])[3, 3] * scale[0])
+    return float(x[0, 3]), _CORRELATION * float(np.sqrt(variance))
+
+
+def preference(
+    turns: Turns,
+    imu: ImuData,
+    body_R_camera: FloatArray,
+    gyro_bias: FloatArray,
+    offsets_s: tuple[float, float],
+) -> FloatArray:
+    """How much better each of the rotations (K,) fits the second of two time offsets.
+
+    Args:
+        turns: rotations of the camera.
+        imu: samples that cover them.
+        body_R_camera: (3, 3) mounting.
+        gyro_bias: (3,) rad/s.
+        offsets_s: t_imu - t_camera.
+
+    Returns:
+        (K,) difference of robust costs, in half squared standard deviations; negative where the
+        first offset fits better.
+    """
+    problem = _Problem(turns, imu)
+    body = problem.body_turns(np.array(offsets_s))
+    r, J = problem.linearized(body, body_R_camera, free=False)
+    squares = np.sum((r + J @ gyro_bias) ** 2, axis=2)
+    noise = max(float(np.median(squares.min(axis=0))) / _MEDIAN_CHI2_3, 1e-9)
+    costs = 0.5 * _CAUCHY_WIDTH**2 * np.log1p(squares / (_CAUCHY_WIDTH**2 * noise))
+    return np.asarray(costs[0] - costs[1])
 
 
 def turns_contradict(

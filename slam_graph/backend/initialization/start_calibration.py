@@ -14,36 +14,25 @@ from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
-from scipy.spatial.transform import Rotation
 
-from slam_graph.arrays import FloatArray
 from slam_graph.backend.backend_config import BackendConfig, CalibrationConfig
+from slam_graph.backend.initialization.clock_monitor import ClockChange, ClockMonitor
 from slam_graph.backend.initialization.gyro_alignment import (
-    MAX_OFFSET_S,
     GyroAlignment,
-    Turns,
     align_gyroscope,
     turns_contradict,
 )
-from slam_graph.backend.initialization.visual_rotation import MIN_COMMON, visual_rotation
-from slam_graph.sensors import FeatureFrame, ImuBuffer, ImuData, Rig
+from slam_graph.backend.initialization.visual_turns import VisualTurns
+from slam_graph.sensors import FeatureFrame, ImuBuffer, Rig
 
-_BASELINE_NS = 400_000_000
-"""Time between the two frames of a rotation; the longer, the larger the change of the rate."""
-_SPACING_NS = 45_000_000
-"""Smallest time between two frames that are used."""
-_ENOUGH_COMMON = 40
-"""A pair of frames with fewer features in common is replaced by one that is nearer in time."""
-_WINDOW_NS = 5_000_000_000
-"""Over this time bias and offset are taken to be constant."""
-_RETRY_NS = 400_000_000
-"""Time between two estimates."""
+_SPACING_NS, _LATER_SPACING_NS = 45_000_000, 360_000_000
+"""Smallest time between two frames that are used, at the start and later."""
+_LATER_TURNS = 10
+"""Fewest rotations for a look at the clock later."""
+_RETRY_NS, _LATER_RETRY_NS, _LATER_PAUSE_NS = 400_000_000, 900_000_000, 5_000_000_000
+"""Time between two estimates at the start, two looks at the clock later, and after a close one."""
 _RECENT_NS = 6_000_000_000
 """How long frames are kept to begin anew from."""
-_SHORTEST_TREND_S = 0.02
-"""The motion within a frame is a line fitted to the gyroscope over the readout, or over this."""
-_MIN_TURNS = 15
-"""Fewest rotations for an estimate."""
 _CLEAR, _CLEAR_WAITING = 30.0, 15.0
 """Smallest margin of the minimum: the second best has a probability of exp(-30) of the best. Less
 is enough as long as there is no state that could be lost."""
@@ -99,19 +88,21 @@ class StartCalibration:
         self._camera = rig.cameras[0]
         self.mounted = self._camera.rotation_known
         self.recent: deque[FeatureFrame] = deque()
-        self._frames: deque[FeatureFrame] = deque()
-        self._turns: deque[tuple[int, int, FloatArray, FloatArray]] = deque()
-        self._seen, self._tried_ns = 0, 0
-        self.done = not config.initialization.check_calibration and self.mounted
+        self._turns = VisualTurns(self._camera, config.noise.pixel_sigma)
+        self._next_ns = 0
+        self._checks = config.initialization.check_calibration
+        self._monitor = ClockMonitor(self._camera) if self.mounted else None
+        self.done = not self._checks and self.mounted
         self.waiting_for = "rotation about two axes, to find how the camera is mounted"
 
     def forget(self) -> None:
         """Forget all frames: those that follow do not continue them."""
-        self._frames.clear()
-        self._turns.clear()
+        self._turns.forget()
         self.recent.clear()
 
-    def add(self, frame: FeatureFrame, imu: ImuBuffer, started: bool) -> FoundCalibration | None:
+    def add(
+        self, frame: FeatureFrame, imu: ImuBuffer, started: bool
+    ) -> FoundCalibration | ClockChange | None:
         """Take the next frame.
 
         Args:
@@ -120,106 +111,58 @@ class StartCalibration:
             started: whether there is a state already.
 
         Returns:
-            A calibration that the old one contradicts; None as long as there is none.
+            A calibration that the old one contradicts, or a change of the clock since then; None as
+            long as there is none.
         """
-        if self.done:
-            self.forget()
+        if self.done and not self._checks:
             return None
         self.recent.append(frame)
         while frame.stamp_ns - self.recent[0].stamp_ns > _RECENT_NS:
             self.recent.popleft()
-        if not self._frames or frame.stamp_ns - self._frames[-1].stamp_ns >= _SPACING_NS:
-            self._add_turn(self._unrolled(frame, imu))
-        if frame.stamp_ns - self._tried_ns < _RETRY_NS:
+        monitor = self._monitor if started else None
+        if self.done:
+            return self._watch(frame, imu, monitor)
+        self._turns.add(frame, imu, self.mounted, _SPACING_NS)
+        if frame.stamp_ns < self._next_ns:
             return None
-        found = self._estimate(imu)
-        self._tried_ns = frame.stamp_ns
-        self.done = self._seen > _GIVE_UP_TURNS and self.mounted and started
+        self._next_ns = frame.stamp_ns + _RETRY_NS
+        covered = self._turns.covered(imu)
+        self.done = self._turns.seen > _GIVE_UP_TURNS and self.mounted and started
+        if covered is None:
+            return None
+        R = self._camera.body_T_camera.rotation().matrix() if self.mounted else None
+        found = align_gyroscope(*covered, R, self._camera.clock_offset_s)
         clear = _CLEAR if started else _CLEAR_WAITING
         if found is None or found.margin < clear or found.misfit > _MAX_MISFIT:
             return None
-        return self._judged(found, _ADOPTED_SIGMA_S if started else _WAITING_SIGMA_S)
+        change = None if monitor is None else monitor.judge(found, covered, imu)
+        return change or self._judged(found, _ADOPTED_SIGMA_S if started else _WAITING_SIGMA_S)
 
-    def _unrolled(self, frame: FeatureFrame, imu: ImuBuffer) -> FeatureFrame:
-        """The frame with the first camera's bearings at the time of its middle row."""
-        camera, seen = self._camera, frame.cameras[0]
-        if camera.readout_s == 0.0 or not self.mounted or len(seen) == 0:
-            return frame
-        around_ns = round(0.5e9 * max(abs(camera.readout_s), _SHORTEST_TREND_S))
-        stamp_ns = frame.stamp_ns + round(camera.clock_offset_s * 1e9)
-        if not imu.covers(stamp_ns - around_ns):
-            return frame
-        rate, slope, _ = imu.trend(stamp_ns, around_ns)
-        seconds = (camera.row_times_s(seen.pixels[:, 1]) - camera.middle_s)[:, None]
-        turn = rate * seconds + 0.5 * slope * seconds**2
-        in_camera = turn @ camera.body_T_camera.rotation().matrix()
-        rays = np.column_stack([seen.normalized, np.ones(len(seen))])
-        rays = Rotation.from_rotvec(in_camera).apply(rays)
-        normalized = rays[:, :2] / np.maximum(rays[:, 2:], 1e-3)
-        turned = replace(seen, normalized=normalized)
-        return FeatureFrame(frame.stamp_ns, (turned, *frame.cameras[1:]))
-
-    def _add_turn(self, frame: FeatureFrame) -> None:
-        """The rotation since the oldest frame with enough of the same features."""
-        while self._frames and frame.stamp_ns - self._frames[0].stamp_ns > _BASELINE_NS:
-            self._frames.popleft()
-        while self._turns and frame.stamp_ns - self._turns[0][0] > _WINDOW_NS:
-            self._turns.popleft()
-        now, model = frame.cameras[0], (self._camera.camera, self._config.noise.pixel_sigma)
-        for before in self._frames:
-            common = len(np.intersect1d(before.cameras[0].ids, now.ids, assume_unique=True))
-            if common < (_ENOUGH_COMMON if before is not self._frames[-1] else MIN_COMMON):
-                continue
-            turn = visual_rotation(before.cameras[0], now, *model, self._expected(frame, before))
-            if turn is not None:
-                row = (before.stamp_ns, frame.stamp_ns, turn.R, turn.information)
-                self._turns.append(row)
-                self._seen += 1
-            break
-        self._frames.append(frame)
-
-    def _expected(self, frame: FeatureFrame, before: FeatureFrame) -> FloatArray | None:
-        """The rotation between two frames if the camera turns on as in the last pair."""
-        if not self._turns:
+    def _watch(
+        self, frame: FeatureFrame, imu: ImuBuffer, monitor: ClockMonitor | None
+    ) -> ClockChange | None:
+        """A change of the clock since the start; few rotations tell whether to look closely."""
+        self._turns.add(frame, imu, self.mounted, _LATER_SPACING_NS)
+        if monitor is None or frame.stamp_ns < self._next_ns:
             return None
-        first_ns, second_ns, R, _ = self._turns[-1]
-        ratio = (frame.stamp_ns - before.stamp_ns) / (second_ns - first_ns)
-        vector = Rotation.from_matrix(R).as_rotvec() * ratio
-        return np.asarray(Rotation.from_rotvec(vector).as_matrix())
+        self._next_ns = frame.stamp_ns + _LATER_RETRY_NS
+        covered = self._turns.covered(imu, _LATER_TURNS)
+        if covered is None or not monitor.suspects(*covered):
+            return None
+        self._next_ns = frame.stamp_ns + _LATER_PAUSE_NS
+        turns = VisualTurns(self._camera, self._config.noise.pixel_sigma)
+        for before in self.recent:
+            turns.add(before, imu, self.mounted, _SPACING_NS)
+        covered = turns.covered(imu)
+        return None if covered is None else monitor.look(covered, imu)
 
     def contradiction(self, imu: ImuBuffer) -> str | None:
         """What of mounting or units the rotations of the last seconds contradict, if anything."""
-        covered = None if self.done else self._covered(imu)
+        covered = None if self.done else self._turns.covered(imu)
         if covered is None or not self.mounted:
             return None
         R = self._camera.body_T_camera.rotation().matrix()
         return turns_contradict(*covered, R, self._camera.clock_offset_s)
-
-    def _estimate(self, imu: ImuBuffer) -> GyroAlignment | None:
-        """The alignment of the turns that the gyroscope covers; None if they are too few."""
-        covered = self._covered(imu)
-        if covered is None:
-            return None
-        R = self._camera.body_T_camera.rotation().matrix() if self.mounted else None
-        return align_gyroscope(*covered, R, self._camera.clock_offset_s)
-
-    def _covered(self, imu: ImuBuffer) -> tuple[Turns, ImuData] | None:
-        """The turns that the gyroscope covers, and its samples; None if they are too few."""
-        nominal_ns = round(self._camera.clock_offset_s * 1e9)
-        around_ns = round(MAX_OFFSET_S * 1e9) + 10_000_000
-        newest_ns = imu.newest_ns() - nominal_ns - around_ns
-        rows = [t for t in self._turns if t[1] <= newest_ns]
-        rows = [t for t in rows if imu.covers(t[0] + nominal_ns - around_ns)]
-        if len(rows) < _MIN_TURNS:
-            return None
-        turns = Turns(
-            np.array([t[0] for t in rows]),
-            np.array([t[1] for t in rows]),
-            np.array([t[2] for t in rows]),
-            np.array([t[3] for t in rows]),
-        )
-        first_ns, last_ns = rows[0][0] + nominal_ns, int(turns.second_ns.max()) + nominal_ns
-        return turns, imu.between(first_ns - around_ns, last_ns + around_ns)
 
     def _judged(self, found: GyroAlignment, largest_sigma_s: float) -> FoundCalibration | None:
         """The new calibration, if what was found is known and contradicts the old one."""
@@ -271,5 +214,8 @@ class StartCalibration:
             }
             message = f"rotation of the camera estimated to {np.rad2deg(sigma):.1f}°; {message}"
             self.mounted = True
+        self._camera = cameras[0]
+        self._turns = VisualTurns(self._camera, self._config.noise.pixel_sigma)
+        self._monitor = ClockMonitor(self._camera, (found.offset_s, found.offset_sigma_s))
         variables = CalibrationConfig(**{**self._config.calibration.model_dump(), **changes})
         return FoundCalibration(replace(self._rig, cameras=tuple(cameras)), variables, message)

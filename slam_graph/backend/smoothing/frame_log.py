@@ -22,6 +22,7 @@ import numpy as np
 from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.backend.depth_camera import with_depth_camera, with_depth_observed
 from slam_graph.backend.dynamics import motionless_samples
+from slam_graph.backend.initialization.clock_monitor import ClockChange
 from slam_graph.backend.smoothing.smoothing_config import FinalBaConfig
 from slam_graph.datasets import TrackRecorder, open_dataset
 from slam_graph.diagnostics import Diagnostics
@@ -58,6 +59,7 @@ class FrameLog:
     Attributes:
         rig: the calibration with which the frames were undistorted.
         observations: number of all of them.
+        clock_changes: of the IMU, which are corrected where samples are read.
         georeferenced: whether the causal estimate is in the world of the position fixes.
         fix_offset_s: added to the times of the fixes, beyond the given offset.
         fix_calibration: lever arm and clock of the fixes, where they are variables.
@@ -76,12 +78,14 @@ class FrameLog:
         self._frames = array("q")
         self._keyframes = array("q")  # numbers of frames
         self._noise = array("d")
+        self._first_ns = 0
         self._lead_ns = round(rig.end_offset_s * 1e9)
         self._imu: list[ImuData] = []
         self._imu_ns: tuple[int, int] | None = None
         self._last_ids = np.zeros(0, np.int64)
         self._aiding: list[AidingData] = []
         self.observations = 0
+        self.clock_changes: tuple[ClockChange, ...] = ()
         self.georeferenced, self.fix_offset_s = False, 0.0
         self.fix_calibration: AidingData.Calibration | None = None
 
@@ -139,6 +143,8 @@ class FrameLog:
         if self._is_keyframe(frame):
             self._keyframes.append(len(self._frames))
             self._last_ids = cameras[0].ids
+        if not self._frames:
+            self._first_ns = frame.stamp_ns
         self._frames.append(frame.stamp_ns)
         self._noise.extend(noise)
 
@@ -183,7 +189,13 @@ class FrameLog:
 
     def packets(self, first: int, stop: int, rig: Rig) -> Iterator[Packet]:
         """Frames `first` to `stop - 1`, each with the samples since the one before."""
-        sequence = open_dataset(self._path, "recording", diagnostics=_Silent())
+        # a change of the clock is undone by the fault that is its opposite
+        undone = [
+            f"imu_late:at_s={(change.since_ns - self._first_ns) * 1e-9!r},by_s={-change.shift_s!r}"
+            for change in self.clock_changes
+        ]
+        silent = _Silent()
+        sequence = open_dataset(self._path, "recording", diagnostics=silent, faults=undone)
         sequence.rig = replace(rig, has_imu=True)  # it says how far the samples lead
         yield from sequence.packets(self._frames[first], self._frames[stop - 1])
 
