@@ -97,8 +97,8 @@ def main(algorithm: str, duration_s: str, complete: str = "") -> None:
             with tempfile.TemporaryDirectory() as folder:
                 result.save(folder)
     table = {
-        "frame": clock.frames.cpu,
-        "reference": clock.flows.cpu,
+        "frame": clock.frames.cpu.tolist(),
+        "reference": clock.flows.cpu.tolist(),
         "memory": clock.memory,
         "peak_mb": peak_memory_mb(),
         "after_s": after_s,

@@ -25,8 +25,8 @@ class StepLog:
 
     def __init__(self) -> None:
         self._stamps_ns = array("q")
-        self._steps = array("l")
-        self._columns = array("l")
+        self._steps = array("i")
+        self._columns = array("i")
         self._costs = array("d")
 
     def __len__(self) -> int:
@@ -73,8 +73,9 @@ class StepLog:
         return np.array(self._costs, dtype=np.float64).reshape(-1, 2)
 
 
-_INNOVATION_COLUMNS = tuple(field.name for field in fields(Innovations))
-_values_of = attrgetter(*_INNOVATION_COLUMNS)
+_COUNTS = tuple(field.name for field in fields(Innovations) if isinstance(field.default, int))
+_SUMS = tuple(field.name for field in fields(Innovations) if field.name not in _COUNTS)
+_counts_of, _sums_of = attrgetter(*_COUNTS), attrgetter(*_SUMS)
 
 
 class InnovationLog:
@@ -82,7 +83,8 @@ class InnovationLog:
 
     def __init__(self) -> None:
         self._stamps_ns = array("q")
-        self._rows = array("d")
+        self._counts = array("i")
+        self._sums = array("d")
 
     def __len__(self) -> int:
         return len(self._stamps_ns)
@@ -91,13 +93,15 @@ class InnovationLog:
         """Add a frame, unless no feature was tested in it."""
         if innovations.tested:
             self._stamps_ns.append(stamp_ns)
-            self._rows.extend(_values_of(innovations))
+            self._counts.extend(_counts_of(innovations))
+            self._sums.extend(_sums_of(innovations))
 
     def forget_from(self, stamp_ns: int) -> None:
         """Forget the frames at and after a time."""
         kept = bisect_left(self._stamps_ns, stamp_ns)
         del self._stamps_ns[kept:]
-        del self._rows[kept * len(_INNOVATION_COLUMNS) :]
+        del self._counts[kept * len(_COUNTS) :]
+        del self._sums[kept * len(_SUMS) :]
 
     @property
     def stamps_ns(self) -> IntArray:
@@ -106,8 +110,10 @@ class InnovationLog:
 
     def columns(self) -> dict[str, FloatArray]:
         """(N,) values of each attribute of `Innovations`, by its name."""
-        rows = np.array(self._rows, dtype=np.float64).reshape(-1, len(_INNOVATION_COLUMNS))
-        return dict(zip(_INNOVATION_COLUMNS, rows.T, strict=True))
+        counts = np.array(self._counts, dtype=np.float64).reshape(-1, len(_COUNTS))
+        sums = np.array(self._sums, dtype=np.float64).reshape(-1, len(_SUMS))
+        columns = dict(zip((*_COUNTS, *_SUMS), (*counts.T, *sums.T), strict=True))
+        return {field.name: columns[field.name] for field in fields(Innovations)}
 
 
 class CalibrationLog:

@@ -236,7 +236,8 @@ def _smoothed(log: FrameLog, causal: Trajectory, task: SmoothingTask, report: Re
             states = _aligned(found, held, start[anchor], level)[begin:]
         if link is not None and not absolute:
             states = in_gauge_of(link, states, level)
-        solved.append(replace(adjusted, states=[]))
+        aligned = None if solved else adjusted.aligned  # of a recording in one segment
+        solved.append(replace(adjusted, states=[], aligned=aligned))
     if not solved:
         raise EstimationError("the causal estimate covers none of the keyframes")
     for state in states:

@@ -23,7 +23,7 @@ from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.backend.depth_camera import with_depth_camera, with_depth_observed
 from slam_graph.backend.dynamics import motionless_samples
 from slam_graph.backend.smoothing.smoothing_config import FinalBaConfig
-from slam_graph.datasets import TrackRecorder, open_dataset
+from slam_graph.datasets import RecordedSequence, TrackRecorder, open_dataset
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.sensors import (
     AidingData,
@@ -183,9 +183,14 @@ class FrameLog:
 
     def packets(self, first: int, stop: int, rig: Rig) -> Iterator[Packet]:
         """Frames `first` to `stop - 1`, each with the samples since the one before."""
-        sequence = open_dataset(self._path, "recording", diagnostics=_Silent())
+        sequence = self._recorded
         sequence.rig = replace(rig, has_imu=True)  # it says how far the samples lead
         yield from sequence.packets(self._frames[first], self._frames[stop - 1])
+
+    @cached_property
+    def _recorded(self) -> RecordedSequence:
+        """All frames as they were recorded: opened once, as its index is that of the whole run."""
+        return open_dataset(self._path, "recording", diagnostics=_Silent())
 
     def _follows(self, frame_ns: int) -> bool:
         """Whether a frame is later than the others and within the IMU samples."""
