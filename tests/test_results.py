@@ -13,6 +13,7 @@ from typing import cast
 import numpy as np
 import pytest
 
+from slam_graph.arrays import GrowingTable
 from slam_graph.backend import Estimator
 from slam_graph.backend.engine_protocol import StepReport
 from slam_graph.config import load_config
@@ -138,6 +139,27 @@ def test_frame_table_has_a_cost_for_each_step_that_was_ever_taken() -> None:
     assert [row["cost_before"] for row in rows] == ["", "8", "", ""]
     assert "cost_after_2" not in rows[0]
     assert [row["tracked"] for row in rows] == ["0"] * 4
+
+
+def test_growing_table_is_what_one_array_would_be() -> None:
+    """Rows over several blocks, cut inside of a block and at its end, and gone on with."""
+    rows = np.arange(3.0 * 2500).reshape(-1, 3)
+    table = GrowingTable(3)
+    assert table.rows().shape == (0, 3)
+    table.extend(rows)
+    assert np.array_equal(table.rows(), rows)
+    for kept in (2049, 2048, 1024, 1023, 0):
+        table.cut(kept)
+        assert np.array_equal(table.rows(), rows[:kept])
+        table.extend(rows[kept:2050])
+        assert len(table) == 2050
+        assert np.array_equal(table.rows(), rows[:2050])
+        table.fill(1030, [0, 2], -1.0)
+        expected = rows[:2050].copy()
+        expected[1030:, [0, 2]] = -1.0
+        assert np.array_equal(table.rows(), expected)
+        table.cut(1030)
+        table.extend(rows[1030:])
 
 
 def test_laps_of_a_stopwatch_add_up() -> None:

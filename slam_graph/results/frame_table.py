@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from slam_graph.arrays import FloatArray, IntArray
+from slam_graph.arrays import FloatArray, GrowingTable, IntArray
 from slam_graph.sensors import FeatureFrame
 
 if TYPE_CHECKING:
@@ -39,7 +39,7 @@ class FrameTable:
 
     def __init__(self) -> None:
         self._stamps_ns = array("q")
-        self._cells = array("f")  # as many digits as are written
+        self._cells = GrowingTable(len(_CELLS), np.float32)  # as many digits as are written
         self._costs: list[array[float]] = []  # a column for each, as many as a frame ever had
         self._row_of: dict[int, int] = {}
         self._keyframe_rows: set[int] = set()
@@ -69,7 +69,7 @@ class FrameTable:
         row: list[float] = [seen[0], sum(seen[1:]), estimated, past, held]
         row += [counts.get(REJECTED[0], 0.0), found.rejected, counts.get(REJECTED[2], 0.0)]
         row += [found.passed_distance, found.passed_dof, found.expected] if tested else 3 * [np.nan]
-        self._cells.extend(row)
+        self._cells.append(row)
         self._note_costs(estimator.report.costs[:_MAX_COSTS])
         if window is not None:
             self._row_of = {n: r for n, r in self._row_of.items() if n in window.past}
@@ -83,8 +83,7 @@ class FrameTable:
         Frames of the window are numbered anew after this.
         """
         first = bisect_left(self._stamps_ns, stamp_ns)
-        if len(self):
-            self._rows()[first:, _OF_STATES] = np.nan
+        self._cells.fill(first, _OF_STATES, math.nan)
         for column in self._costs:
             column[first:] = _UNKNOWN * (len(self) - first)
         self._row_of = {}
@@ -132,13 +131,9 @@ class FrameTable:
         for k, column in enumerate(self._costs):
             column.append(costs[k] if k < len(costs) else math.nan)
 
-    def _rows(self) -> NDArray[np.float32]:
-        """(F, columns) a view of all cells but the costs."""
-        return np.frombuffer(self._cells, np.float32).reshape(-1, len(_CELLS))
-
     def _table(self) -> NDArray[np.float32]:
         """(F, columns) a copy of all cells, with at least one cost."""
-        return np.column_stack([self._rows(), *(self._costs or [_UNKNOWN * len(self)])])
+        return np.column_stack([self._cells.rows(), *(self._costs or [_UNKNOWN * len(self)])])
 
 
 def _cell(value: float, whole: bool) -> str:

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from slam_graph.arrays import FloatArray, IntArray
+from slam_graph.arrays import FloatArray, GrowingTable, IntArray
 from slam_graph.backend import Innovations
 from slam_graph.results.frame_table import FrameTable
 from slam_graph.sensors import CalibrationEstimate
@@ -27,7 +27,7 @@ class StepLog:
         self._stamps_ns = array("q")
         self._steps = array("i")
         self._columns = array("i")
-        self._costs = array("d")
+        self._costs = GrowingTable(2)
 
     def __len__(self) -> int:
         return len(self._stamps_ns)
@@ -43,14 +43,14 @@ class StepLog:
         self._columns.append(columns)
         self._stamps_ns.append(stamp_ns)
         self._steps.append(len(costs) - 1)
-        self._costs.extend((costs[0], costs[-1]))
+        self._costs.append((costs[0], costs[-1]))
 
     def forget_from(self, stamp_ns: int) -> None:
         """Forget the frames at and after a time."""
         kept = bisect_left(self._stamps_ns, stamp_ns)
         for column in (self._stamps_ns, self._steps, self._columns):
             del column[kept:]
-        del self._costs[2 * kept :]
+        self._costs.cut(kept)
 
     @property
     def stamps_ns(self) -> IntArray:
@@ -70,7 +70,7 @@ class StepLog:
     @property
     def costs(self) -> FloatArray:
         """(N, 2) cost before the first step and after the last."""
-        return np.array(self._costs, dtype=np.float64).reshape(-1, 2)
+        return self._costs.rows()
 
 
 _COUNTS = tuple(field.name for field in fields(Innovations) if isinstance(field.default, int))
@@ -83,8 +83,8 @@ class InnovationLog:
 
     def __init__(self) -> None:
         self._stamps_ns = array("q")
-        self._counts = array("i")
-        self._sums = array("d")
+        self._counts = GrowingTable(len(_COUNTS), np.int32)
+        self._sums = GrowingTable(len(_SUMS))
 
     def __len__(self) -> int:
         return len(self._stamps_ns)
@@ -93,15 +93,15 @@ class InnovationLog:
         """Add a frame, unless no feature was tested in it."""
         if innovations.tested:
             self._stamps_ns.append(stamp_ns)
-            self._counts.extend(_counts_of(innovations))
-            self._sums.extend(_sums_of(innovations))
+            self._counts.append(_counts_of(innovations))
+            self._sums.append(_sums_of(innovations))
 
     def forget_from(self, stamp_ns: int) -> None:
         """Forget the frames at and after a time."""
         kept = bisect_left(self._stamps_ns, stamp_ns)
         del self._stamps_ns[kept:]
-        del self._counts[kept * len(_COUNTS) :]
-        del self._sums[kept * len(_SUMS) :]
+        self._counts.cut(kept)
+        self._sums.cut(kept)
 
     @property
     def stamps_ns(self) -> IntArray:
@@ -110,8 +110,7 @@ class InnovationLog:
 
     def columns(self) -> dict[str, FloatArray]:
         """(N,) values of each attribute of `Innovations`, by its name."""
-        counts = np.array(self._counts, dtype=np.float64).reshape(-1, len(_COUNTS))
-        sums = np.array(self._sums, dtype=np.float64).reshape(-1, len(_SUMS))
+        counts, sums = self._counts.rows().astype(np.float64), self._sums.rows()
         columns = dict(zip((*_COUNTS, *_SUMS), (*counts.T, *sums.T), strict=True))
         return {field.name: columns[field.name] for field in fields(Innovations)}
 
