@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import os
 import time
+from array import array
 
 import cv2
 import numpy as np
@@ -31,8 +32,8 @@ class Watch:
     """
 
     def __init__(self) -> None:
-        self.wall: list[float] = []
-        self.cpu: list[float] = []
+        self.wall = array("d")  # of boxed floats, a long run's times would take more than its logs
+        self.cpu = array("d")
         self.start()
 
     def start(self) -> None:

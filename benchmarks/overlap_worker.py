@@ -75,7 +75,7 @@ def main(recording: str, algorithm: str) -> None:
     with threadpool_limits(limits=1):
         reference = Reference()
         run(sequence, configs["in_turn"], viewer=reference).check()
-        table: dict[str, Any] = {"reference": reference.flows.cpu, "cores": os.cpu_count()}
+        table: dict[str, Any] = {"reference": reference.flows.cpu.tolist(), "cores": os.cpu_count()}
         for _ in range(REPETITIONS):
             for name, config in configs.items():
                 table.setdefault(name, []).append(timed(sequence, config))

@@ -168,8 +168,8 @@ class Costs:
         """Write costs and causal poses; to be called when all threads have come to their end."""
         total_s = time.process_time() - self._began_s - self._others_s
         table = {
-            "reference": self.flows.cpu,
-            "frame": self.frames.cpu,
+            "reference": self.flows.cpu.tolist(),
+            "frame": self.frames.cpu.tolist(),
             "all_threads_ms": 1e3 * total_s,
         }
         (folder / COSTS_FILE).write_text(json.dumps(table), encoding="utf-8")

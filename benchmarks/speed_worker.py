@@ -62,12 +62,12 @@ def interleaved(recording: Path, config: RunConfig) -> Table:
     stages = {
         name: result.logs.timing.column(name).tolist() for name in result.logs.timing.stages()
     }
-    stages["frame"] = reference.frames.wall
-    stages["decoding"] = sequence.decoding.wall
+    stages["frame"] = reference.frames.wall.tolist()
+    stages["decoding"] = sequence.decoding.wall.tolist()
     return {
-        "reference": reference.flows.cpu,
-        "frame": reference.frames.cpu,
-        "decoding": sequence.decoding.cpu,
+        "reference": reference.flows.cpu.tolist(),
+        "frame": reference.frames.cpu.tolist(),
+        "decoding": sequence.decoding.cpu.tolist(),
         "stages": stages,
         "wall_s": result.ending.wall_s,
         "cpu_s": cpu_s,

@@ -1,19 +1,78 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""Array types that all modules share, the matrix of the cross product, and medians."""
+"""Array types that all modules share, tables that grow, cross products as matrices, and medians."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, DTypeLike, NDArray
 
-__all__ = ["BoolArray", "FloatArray", "IntArray", "lengths_of", "median", "skew"]
+__all__ = [
+    "BoolArray",
+    "FloatArray",
+    "GrowingTable",
+    "IntArray",
+    "median",
+    "skew",
+]
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
+
+_ROWS_PER_BLOCK = 1024
+
+
+class GrowingTable:
+    """Rows of as many numbers each, which grow one by one, in blocks that never move.
+
+    One array that grows moves to a larger place again and again. Between what else is allocated
+    meanwhile it leaves holes of its size, which stay in the memory of the process.
+
+    Args:
+        width: numbers in a row.
+        dtype: their type.
+    """
+
+    def __init__(self, width: int, dtype: DTypeLike = np.float64) -> None:
+        self._width, self._dtype = width, np.dtype(dtype)
+        self._blocks: list[NDArray[Any]] = []
+        self._count = 0
+
+    def __len__(self) -> int:
+        return self._count
+
+    def append(self, row: ArrayLike) -> None:
+        """Add a row (width,)."""
+        place = self._count % _ROWS_PER_BLOCK
+        if place == 0:
+            self._blocks.append(np.empty((_ROWS_PER_BLOCK, self._width), self._dtype))
+        self._blocks[-1][place] = row
+        self._count += 1
+
+    def extend(self, rows: NDArray[Any]) -> None:
+        """Add rows (N, width)."""
+        for row in rows:
+            self.append(row)
+
+    def cut(self, count: int) -> None:
+        """Keep the first `count` rows."""
+        self._count = min(count, self._count)
+        del self._blocks[-(-self._count // _ROWS_PER_BLOCK) :]
+
+    def fill(self, first: int, columns: Sequence[int], value: float) -> None:
+        """Put a value into some columns, from a row on."""
+        for number, block in enumerate(self._blocks):
+            block[max(first - number * _ROWS_PER_BLOCK, 0) :, columns] = value
+
+    def rows(self) -> NDArray[Any]:
+        """(N, width) a copy of all rows."""
+        if not self._blocks:
+            return np.empty((0, self._width), self._dtype)
+        return np.concatenate(self._blocks)[: self._count]
 
 
 def skew(v: FloatArray) -> FloatArray:
@@ -23,12 +82,6 @@ def skew(v: FloatArray) -> FloatArray:
     matrix[..., 2, 1], matrix[..., 0, 2], matrix[..., 1, 0] = x, y, z
     matrix[..., 1, 2], matrix[..., 2, 0], matrix[..., 0, 1] = -x, -y, -z
     return matrix
-
-
-def lengths_of(vectors: FloatArray) -> FloatArray:
-    """Lengths (N,) of vectors (N, k) that a file gave, silently infinite beyond 1e154."""
-    with np.errstate(over="ignore", invalid="ignore"):
-        return np.asarray(np.linalg.norm(vectors, axis=1))
 
 
 def median(values: NDArray[Any]) -> FloatArray:

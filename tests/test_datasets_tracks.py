@@ -232,6 +232,39 @@ def test_empty_frames_and_packets_are_kept(simulated: Path, tmp_path: Path) -> N
     assert TrackRecordingSequence(tmp_path / "none").info().frames == 0
 
 
+def test_a_part_has_the_samples_of_the_whole(simulated: Path, tmp_path: Path) -> None:
+    """Blocks of samples before the part are not read; its first packet has those of a second."""
+    rig, period_ns = OpenvinsSimulation(simulated).rig, 5_000_000
+    nothing = (FeatureObservations.empty(), FeatureObservations.empty())
+    with TrackRecorder(tmp_path / "long", rig) as recorder:
+        for k in range(600):
+            stamps = (20 * k + np.arange(1, 21)) * period_ns
+            values = 0.1 * np.random.default_rng(k).normal(size=(20, 3))
+            recorder.write(ImuData(stamps, values, values), FeatureFrame(int(stamps[-1]), nothing))
+    replay = TrackRecordingSequence(tmp_path / "long")
+    whole = replay.imu()
+    assert len(whole) == 12_000
+    for first in (0, 203, 204, 205, 206, 420, 599):
+        part = [packet.imu for packet in replay.packets(20 * (first + 1) * period_ns)]
+        begin = max(0, 20 * (first + 1) - 201)
+        expected = whole.gyro[begin:]
+        assert np.array_equal(np.concatenate([imu.gyro for imu in part]), expected)
+        assert all(np.array_equal(imu.gyro, imu.accel) for imu in part)
+
+
+def test_recording_keeps_nothing_of_a_frame_in_memory(simulated: Path, tmp_path: Path) -> None:
+    rig, seen = OpenvinsSimulation(simulated).rig, FeatureObservations.empty()
+    with TrackRecorder(tmp_path / "long", rig) as recorder:
+        tracemalloc.start()
+        used = []
+        for first, stop in ((0, 100), (100, 1100)):
+            for stamp in range(first, stop):
+                recorder.write(ImuData.empty(), FeatureFrame(stamp, (seen, seen)))
+            used.append(tracemalloc.get_traced_memory()[0])
+        tracemalloc.stop()
+    assert used[1] - used[0] < 1000  # a byte a frame
+
+
 def test_recording_is_whole_or_not_there(simulated: Path, tmp_path: Path) -> None:
     rig = OpenvinsSimulation(simulated).rig
     before = sorted(tmp_path.iterdir())

@@ -7,10 +7,15 @@ import json
 import logging
 from datetime import UTC, datetime
 from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import pytest
 
+from slam_graph.arrays import GrowingTable
+from slam_graph.backend import Estimator
+from slam_graph.backend.engine_protocol import StepReport
 from slam_graph.config import load_config
 from slam_graph.datasets.groundtruth import read_groundtruth
 from slam_graph.datasets.sequence import SequenceInfo
@@ -18,6 +23,7 @@ from slam_graph.errors import DataError
 from slam_graph.files import Files
 from slam_graph.geometry.trajectory import NavState, Trajectory
 from slam_graph.pipeline.tracking import Stopwatch
+from slam_graph.results.frame_table import FrameTable
 from slam_graph.results.map_output import PointMap, write_ply
 from slam_graph.results.metrics import SCHEMA_VERSION, finite
 from slam_graph.results.result_files import ResultFolder
@@ -25,6 +31,7 @@ from slam_graph.results.run_input import RunInput
 from slam_graph.results.run_logs import TimingLog
 from slam_graph.results.run_result import RunResult
 from slam_graph.results.saved_run import load_result
+from slam_graph.sensors.measurements import FeatureFrame, FeatureObservations
 from slam_graph.sensors.rig import Rig
 
 NOON = datetime(2026, 3, 4, 12, 0, 0, tzinfo=UTC)
@@ -108,6 +115,51 @@ def test_timing_table_keeps_stages_that_come_late() -> None:
     summary = log.summary()
     assert (summary["read"].mean_ms, summary["read"].frames) == (2.0, 2)
     assert (summary["backend"].median_ms, summary["backend"].frames) == (5.0, 1)
+
+
+def test_frame_table_has_a_cost_for_each_step_that_was_ever_taken() -> None:
+    """Frames take different numbers of steps; what is taken back of states leaves the counts."""
+    table, seen = FrameTable(), FeatureObservations.empty()
+    given: list[tuple[float, ...]] = [(), (8.0, 4.0), (9.0, 3.0, 1.0), (7.0, 6.0)]
+    for stamp_ns, costs in enumerate(given):
+        estimator = cast(Estimator, SimpleNamespace(window=None, report=StepReport(costs=costs)))
+        table.append(FeatureFrame(stamp_ns, (seen,)), 0, estimator, {})
+    none = np.zeros(0, np.int64)
+    rows = list(csv.DictReader(table.csv_lines(none, None)))
+    names = [name for name in rows[0] if name.startswith("cost")]
+    assert names == ["cost_before", "cost_after_1", "cost_after_2"]
+    assert [[row[name] for name in names] for row in rows] == [
+        ["", "", ""],
+        ["8", "4", ""],
+        ["9", "3", "1"],
+        ["7", "6", ""],
+    ]
+    table.forget_from(2)
+    rows = list(csv.DictReader(table.csv_lines(none, None)))
+    assert [row["cost_before"] for row in rows] == ["", "8", "", ""]
+    assert "cost_after_2" not in rows[0]
+    assert [row["tracked"] for row in rows] == ["0"] * 4
+
+
+def test_growing_table_is_what_one_array_would_be() -> None:
+    """Rows over several blocks, cut inside of a block and at its end, and gone on with."""
+    rows = np.arange(3.0 * 2500).reshape(-1, 3)
+    table = GrowingTable(3)
+    assert table.rows().shape == (0, 3)
+    table.extend(rows)
+    assert np.array_equal(table.rows(), rows)
+    for kept in (2049, 2048, 1024, 1023, 0):
+        table.cut(kept)
+        assert np.array_equal(table.rows(), rows[:kept])
+        table.extend(rows[kept:2050])
+        assert len(table) == 2050
+        assert np.array_equal(table.rows(), rows[:2050])
+        table.fill(1030, [0, 2], -1.0)
+        expected = rows[:2050].copy()
+        expected[1030:, [0, 2]] = -1.0
+        assert np.array_equal(table.rows(), expected)
+        table.cut(1030)
+        table.extend(rows[1030:])
 
 
 def test_laps_of_a_stopwatch_add_up() -> None:

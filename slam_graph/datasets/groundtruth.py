@@ -12,7 +12,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from slam_graph.arrays import FloatArray, IntArray, lengths_of
+from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.datasets.calibration.euroc_calibration import read_body_T_sensor
 from slam_graph.datasets.streams.csv_rows import (
     STAMP_TEXT,
@@ -20,6 +20,7 @@ from slam_graph.datasets.streams.csv_rows import (
     read_rows,
     stamps_from_seconds,
 )
+from slam_graph.datasets.streams.vector_lengths import lengths_of
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import DataError
 from slam_graph.geometry import Trajectory

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from slam_graph.arrays import FloatArray
+from slam_graph.arrays import FloatArray, GrowingTable
 from slam_graph.geometry.trajectory import NavState, Trajectory
 
 if TYPE_CHECKING:
@@ -39,9 +39,9 @@ class StateHistory:
         """Begin without states; see the class for `level` and `has_scale`."""
         self.level, self.has_scale = level, has_scale
         self._stamps_ns = array("q")
-        self._states = array("d")
-        self._pose_covariances = array("d")  # their upper triangles: runs may be of hours
-        self._other_variances = array("d")
+        self._states = GrowingTable(_STATE_WIDTH)
+        self._pose_covariances = GrowingTable(len(_UPPER[0]))  # upper triangles: runs may be long
+        self._other_variances = GrowingTable(_ERROR_WIDTH - _POSE_WIDTH)
 
     def __len__(self) -> int:
         return len(self._stamps_ns)
@@ -77,28 +77,27 @@ class StateHistory:
         if covariance is None:
             covariance = np.full((_ERROR_WIDTH, _ERROR_WIDTH), np.nan)
         self._stamps_ns.append(state.stamp_ns)
-        self._states.extend(row.tolist())
-        self._pose_covariances.extend(covariance[_UPPER].tolist())
-        self._other_variances.extend(covariance.diagonal()[_POSE_WIDTH:].tolist())
+        self._states.append(row)
+        self._pose_covariances.append(covariance[_UPPER])
+        self._other_variances.append(covariance.diagonal()[_POSE_WIDTH:])
 
     def extend(self, other: StateHistory) -> None:
         """Add all states of another history, which are later."""
         self._stamps_ns.extend(other._stamps_ns)
-        self._states.extend(other._states)
-        self._pose_covariances.extend(other._pose_covariances)
-        self._other_variances.extend(other._other_variances)
+        self._states.extend(other._states.rows())
+        self._pose_covariances.extend(other._pose_covariances.rows())
+        self._other_variances.extend(other._other_variances.rows())
 
     def forget_from(self, stamp_ns: int) -> None:
         """Forget the states at and after a time."""
         kept = bisect_left(self._stamps_ns, stamp_ns)
         del self._stamps_ns[kept:]
-        del self._states[kept * _STATE_WIDTH :]
-        del self._pose_covariances[kept * len(_UPPER[0]) :]
-        del self._other_variances[kept * (_ERROR_WIDTH - _POSE_WIDTH) :]
+        for table in (self._states, self._pose_covariances, self._other_variances):
+            table.cut(kept)
 
     def trajectory(self) -> Trajectory:
         """The states as a trajectory with velocities and biases."""
-        rows = _table(self._states, _STATE_WIDTH)
+        rows = self._states.rows()
         return Trajectory(
             np.array(self._stamps_ns, dtype=np.int64),
             rows[:, 0:3],
@@ -111,19 +110,13 @@ class StateHistory:
     def sigmas(self) -> FloatArray:
         """(N, 15) standard deviations, in the order of `NavState.COMPONENTS`."""
         poses = np.diagonal(self.pose_covariances(), axis1=1, axis2=2)
-        others = _table(self._other_variances, _ERROR_WIDTH - _POSE_WIDTH)
-        variances = np.concatenate([poses, others], axis=1)
+        variances = np.concatenate([poses, self._other_variances.rows()], axis=1)
         return np.asarray(np.sqrt(np.maximum(variances, 0.0)), dtype=np.float64)
 
     def pose_covariances(self) -> FloatArray:
         """(N, 6, 6) covariances of rotation and position, in the body frame."""
-        triangles = _table(self._pose_covariances, len(_UPPER[0]))
+        triangles = self._pose_covariances.rows()
         covariances = np.empty((len(triangles), _POSE_WIDTH, _POSE_WIDTH))
         rows, columns = _UPPER
         covariances[:, rows, columns] = covariances[:, columns, rows] = triangles
         return covariances
-
-
-def _table(values: array[float], width: int) -> FloatArray:
-    """A copy of flat values as rows of `width`."""
-    return np.array(values, dtype=np.float64).reshape(-1, width)

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from scipy.spatial.transform import Rotation
 
-from slam_graph.arrays import BoolArray, lengths_of
+from slam_graph.arrays import BoolArray
 from slam_graph.datasets import kalibr_text, rig_from_kalibr
 from slam_graph.errors import DataError
 from slam_graph.loop_closure import Vocabulary
@@ -287,7 +287,8 @@ def _assemble(header: _Header, arrays: dict[str, NDArray[Any]], path: Path) -> S
 def _poses(arrays: dict[str, NDArray[Any]], prefix: str, path: Path) -> Poses:
     """Poses from positions and unit quaternions."""
     quaternions, positions = arrays[f"{prefix}quaternions"], arrays[f"{prefix}positions"]
-    lengths = lengths_of(quaternions)
+    with np.errstate(over="ignore", invalid="ignore"):
+        lengths = np.linalg.norm(quaternions, axis=1)
     if not np.all(np.abs(lengths - 1.0) < 1e-6):
         row = int(np.argmax(~(np.abs(lengths - 1.0) < 1e-6)))
         raise DataError(

@@ -7,13 +7,13 @@ from __future__ import annotations
 import math
 from array import array
 from bisect import bisect_left
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from slam_graph.arrays import FloatArray, IntArray
+from slam_graph.arrays import FloatArray, GrowingTable, IntArray
 from slam_graph.sensors import FeatureFrame
 
 if TYPE_CHECKING:
@@ -28,9 +28,10 @@ INNOVATION = ("nis", "nis_dof", "nis_expected")
 COSTS = ("cost_before", *(f"cost_after_{k}" for k in range(1, _MAX_COSTS)))
 NEES = ("nees_position", "nees_orientation")
 KEYFRAME = "keyframe"
-_COLUMNS = (*COUNTS, "features_in_state", *REJECTED, *INNOVATION, *COSTS)
+_CELLS = (*COUNTS, "features_in_state", *REJECTED, *INNOVATION)
 _WHOLE = (*COUNTS, "features_in_state", *REJECTED, "nis_dof")
-_OF_STATES = [_COLUMNS.index(name) for name in (*INNOVATION, *COSTS)]
+_OF_STATES = [_CELLS.index(name) for name in INNOVATION]
+_UNKNOWN = array("f", [math.nan])
 
 
 class FrameTable:
@@ -38,7 +39,8 @@ class FrameTable:
 
     def __init__(self) -> None:
         self._stamps_ns = array("q")
-        self._cells = array("f")  # as many digits as are written
+        self._cells = GrowingTable(len(_CELLS), np.float32)  # as many digits as are written
+        self._costs: list[array[float]] = []  # a column for each, as many as a frame ever had
         self._row_of: dict[int, int] = {}
         self._keyframe_rows: set[int] = set()
 
@@ -64,11 +66,11 @@ class FrameTable:
         window, found = estimator.window, estimator.report.innovations
         past, held = (0, 0) if window is None else (len(window.past), len(window.state_features))
         tested = bool(found.passed_dof)
-        costs = [*estimator.report.costs[:_MAX_COSTS]]
         row: list[float] = [seen[0], sum(seen[1:]), estimated, past, held]
         row += [counts.get(REJECTED[0], 0.0), found.rejected, counts.get(REJECTED[2], 0.0)]
         row += [found.passed_distance, found.passed_dof, found.expected] if tested else 3 * [np.nan]
-        self._cells.extend([*row, *costs, *(_MAX_COSTS - len(costs)) * [np.nan]])
+        self._cells.append(row)
+        self._note_costs(estimator.report.costs[:_MAX_COSTS])
         if window is not None:
             self._row_of = {n: r for n, r in self._row_of.items() if n in window.past}
             self._row_of[window.frame] = len(self)
@@ -81,8 +83,9 @@ class FrameTable:
         Frames of the window are numbered anew after this.
         """
         first = bisect_left(self._stamps_ns, stamp_ns)
-        if len(self):
-            self._table()[first:, _OF_STATES] = np.nan
+        self._cells.fill(first, _OF_STATES, math.nan)
+        for column in self._costs:
+            column[first:] = _UNKNOWN * (len(self) - first)
         self._row_of = {}
         self._keyframe_rows = {row for row in self._keyframe_rows if row < first}
 
@@ -110,9 +113,9 @@ class FrameTable:
         if nees is not None:
             _, rows, found = np.intersect1d(stamps_ns, nees[0], return_indices=True)
             errors[rows] = nees[1][found]
-        always = _COLUMNS.index(COSTS[0])
+        always = len(_CELLS)  # the cost before the steps
         last = max([always, *np.flatnonzero(np.isfinite(table).any(axis=0)).tolist()])
-        titles = _COLUMNS[: last + 1]
+        titles = (*_CELLS, *COSTS)[: last + 1]
         yield ",".join(["stamp_ns", KEYFRAME, *titles, *NEES]) + "\n"
         marks = np.isin(stamps_ns, keyframes_ns)
         whole = [name in _WHOLE for name in titles]
@@ -121,9 +124,16 @@ class FrameTable:
             cells += [_cell(value, False) for value in error.tolist()]
             yield ",".join([str(stamp_ns), str(int(mark)), *cells]) + "\n"
 
+    def _note_costs(self, costs: Sequence[float]) -> None:
+        """Note the costs of the next frame; those that it does not have are not known."""
+        while len(self._costs) < len(costs):
+            self._costs.append(_UNKNOWN * len(self))
+        for k, column in enumerate(self._costs):
+            column.append(costs[k] if k < len(costs) else math.nan)
+
     def _table(self) -> NDArray[np.float32]:
-        """(F, columns) a view of all cells."""
-        return np.frombuffer(self._cells, np.float32).reshape(-1, len(_COLUMNS))
+        """(F, columns) a copy of all cells, with at least one cost."""
+        return np.column_stack([self._cells.rows(), *(self._costs or [_UNKNOWN * len(self)])])
 
 
 def _cell(value: float, whole: bool) -> str:

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from slam_graph.arrays import FloatArray, IntArray
+from slam_graph.arrays import FloatArray, GrowingTable, IntArray
 from slam_graph.backend import Innovations
 from slam_graph.results.frame_table import FrameTable
 from slam_graph.sensors import CalibrationEstimate
@@ -25,9 +25,9 @@ class StepLog:
 
     def __init__(self) -> None:
         self._stamps_ns = array("q")
-        self._steps = array("l")
-        self._columns = array("l")
-        self._costs = array("d")
+        self._steps = array("i")
+        self._columns = array("i")
+        self._costs = GrowingTable(2)
 
     def __len__(self) -> int:
         return len(self._stamps_ns)
@@ -43,14 +43,14 @@ class StepLog:
         self._columns.append(columns)
         self._stamps_ns.append(stamp_ns)
         self._steps.append(len(costs) - 1)
-        self._costs.extend((costs[0], costs[-1]))
+        self._costs.append((costs[0], costs[-1]))
 
     def forget_from(self, stamp_ns: int) -> None:
         """Forget the frames at and after a time."""
         kept = bisect_left(self._stamps_ns, stamp_ns)
         for column in (self._stamps_ns, self._steps, self._columns):
             del column[kept:]
-        del self._costs[2 * kept :]
+        self._costs.cut(kept)
 
     @property
     def stamps_ns(self) -> IntArray:
@@ -70,11 +70,12 @@ class StepLog:
     @property
     def costs(self) -> FloatArray:
         """(N, 2) cost before the first step and after the last."""
-        return np.array(self._costs, dtype=np.float64).reshape(-1, 2)
+        return self._costs.rows()
 
 
-_INNOVATION_COLUMNS = tuple(field.name for field in fields(Innovations))
-_values_of = attrgetter(*_INNOVATION_COLUMNS)
+_COUNTS = tuple(field.name for field in fields(Innovations) if isinstance(field.default, int))
+_SUMS = tuple(field.name for field in fields(Innovations) if field.name not in _COUNTS)
+_counts_of, _sums_of = attrgetter(*_COUNTS), attrgetter(*_SUMS)
 
 
 class InnovationLog:
@@ -82,7 +83,8 @@ class InnovationLog:
 
     def __init__(self) -> None:
         self._stamps_ns = array("q")
-        self._rows = array("d")
+        self._counts = GrowingTable(len(_COUNTS), np.int32)
+        self._sums = GrowingTable(len(_SUMS))
 
     def __len__(self) -> int:
         return len(self._stamps_ns)
@@ -91,13 +93,15 @@ class InnovationLog:
         """Add a frame, unless no feature was tested in it."""
         if innovations.tested:
             self._stamps_ns.append(stamp_ns)
-            self._rows.extend(_values_of(innovations))
+            self._counts.append(_counts_of(innovations))
+            self._sums.append(_sums_of(innovations))
 
     def forget_from(self, stamp_ns: int) -> None:
         """Forget the frames at and after a time."""
         kept = bisect_left(self._stamps_ns, stamp_ns)
         del self._stamps_ns[kept:]
-        del self._rows[kept * len(_INNOVATION_COLUMNS) :]
+        self._counts.cut(kept)
+        self._sums.cut(kept)
 
     @property
     def stamps_ns(self) -> IntArray:
@@ -106,8 +110,9 @@ class InnovationLog:
 
     def columns(self) -> dict[str, FloatArray]:
         """(N,) values of each attribute of `Innovations`, by its name."""
-        rows = np.array(self._rows, dtype=np.float64).reshape(-1, len(_INNOVATION_COLUMNS))
-        return dict(zip(_INNOVATION_COLUMNS, rows.T, strict=True))
+        counts, sums = self._counts.rows().astype(np.float64), self._sums.rows()
+        columns = dict(zip((*_COUNTS, *_SUMS), (*counts.T, *sums.T), strict=True))
+        return {field.name: columns[field.name] for field in fields(Innovations)}
 
 
 class CalibrationLog:

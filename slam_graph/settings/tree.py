@@ -81,6 +81,15 @@ class ConfigTree:
             raise error(f"{fault.where(path)}: not valid YAML ({fault.reason})") from None
 
     @staticmethod
+    def value(text: str) -> Any:
+        """The value of a YAML text that nobody vouches for: bounded, and without tags.
+
+        Raises:
+            YamlTextError: if it is not YAML, or nested or repeated beyond all bounds.
+        """
+        return parse_value(text)[0]
+
+    @staticmethod
     def override(text: str) -> ConfigTree:
         """The tree of one `a.b=value`; the value is read as YAML, which gives it its type.
 

@@ -24,7 +24,7 @@ from slam_graph.backend.depth_camera import with_depth_camera, with_depth_observ
 from slam_graph.backend.dynamics import motionless_samples
 from slam_graph.backend.initialization.clock_monitor import ClockChange
 from slam_graph.backend.smoothing.smoothing_config import FinalBaConfig
-from slam_graph.datasets import TrackRecorder, open_dataset
+from slam_graph.datasets import RecordedSequence, TrackRecorder, open_dataset
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.sensors import (
     AidingData,
@@ -189,15 +189,19 @@ class FrameLog:
 
     def packets(self, first: int, stop: int, rig: Rig) -> Iterator[Packet]:
         """Frames `first` to `stop - 1`, each with the samples since the one before."""
+        sequence = self._recorded
+        sequence.rig = replace(rig, has_imu=True)  # it says how far the samples lead
+        yield from sequence.packets(self._frames[first], self._frames[stop - 1])
+
+    @cached_property
+    def _recorded(self) -> RecordedSequence:
+        """All frames as they were recorded: opened once, as its index is that of the whole run."""
         # a change of the clock is undone by the fault that is its opposite
         undone = [
             f"imu_late:at_s={(change.since_ns - self._first_ns) * 1e-9!r},by_s={-change.shift_s!r}"
             for change in self.clock_changes
         ]
-        silent = _Silent()
-        sequence = open_dataset(self._path, "recording", diagnostics=silent, faults=undone)
-        sequence.rig = replace(rig, has_imu=True)  # it says how far the samples lead
-        yield from sequence.packets(self._frames[first], self._frames[stop - 1])
+        return open_dataset(self._path, "recording", diagnostics=_Silent(), faults=undone)
 
     def _follows(self, frame_ns: int) -> bool:
         """Whether a frame is later than the others and within the IMU samples."""

@@ -42,8 +42,9 @@ class ObjectColumns:
         self._open_file = open_file
         self._labels: BinaryIO | None = None
         self._moving: BinaryIO | None = None
+        self._moving_frames: BinaryIO | None = None
         self._features = 0  # of the first camera
-        self._counts: list[list[int]] = []
+        self._frames = self._moved = 0  # frames so far, and features that move in them
 
     def write(self, frame: FeatureFrame) -> None:
         """Append a frame."""
@@ -55,22 +56,25 @@ class ObjectColumns:
             self._labels.write(_labels(seen.labels, len(seen)).tobytes())
         self._features += len(seen)
         moving = frame.moving or (FeatureObservations.empty(),) * len(frame.cameras)
-        self._counts.append([len(camera) for camera in moving])
-        if self._moving is None and any(self._counts[-1]):
+        counts = np.array([len(camera) for camera in moving], COUNT_RECORD)
+        if self._moving is None and counts.any():
             self._moving = self._open_file(MOVING)
-        if self._moving is not None:
+            self._moving_frames = self._open_file(MOVING_FRAMES)
+            self._moving_frames.write(np.zeros(self._frames * len(moving), COUNT_RECORD).tobytes())
+        if self._moving is not None and self._moving_frames is not None:
+            self._moving_frames.write(counts.tobytes())
             for camera in moving:
                 self._moving.write(_pack(camera).tobytes())
+        self._frames += 1
+        self._moved += int(counts.sum())
 
     def finish(self) -> dict[str, Any]:
-        """Write what is left; what ``meta.yaml`` says of it."""
+        """What ``meta.yaml`` says of them."""
         meta: dict[str, Any] = {}
         if self._labels is not None:
             meta["labels"] = 1
         if self._moving is not None:
-            counts = np.array(self._counts, COUNT_RECORD)
-            self._open_file(MOVING_FRAMES).write(counts.tobytes())
-            meta["moving_features"] = int(counts.sum())
+            meta["moving_features"] = self._moved
         return meta
 
 

@@ -12,9 +12,10 @@ from zipfile import ZipFile
 import gtsam
 import numpy as np
 
-from slam_graph.arrays import FloatArray, lengths_of
+from slam_graph.arrays import FloatArray
 from slam_graph.datasets.calibration.calibration_yaml import pose_from_matrix
 from slam_graph.datasets.formats.recorded_files import AGAIN
+from slam_graph.datasets.streams.vector_lengths import lengths_of
 from slam_graph.errors import DataError
 from slam_graph.geometry import NavState, Trajectory
 

@@ -180,15 +180,28 @@ class TrackRecordingSequence(RecordedSequence):
 
     def imu_blocks(self, after_ns: int | None = None) -> Iterator[ImuData]:
         """The IMU stream from `after_ns` on."""
-        return clean_blocks(self._samples_in_blocks(), self.diagnostics, after_ns)
+        return clean_blocks(self._samples_in_blocks(after_ns), self.diagnostics, after_ns)
 
-    def _samples_in_blocks(self) -> Iterator[tuple[Callable[[int], str], ImuData]]:
+    def _samples_in_blocks(
+        self, after_ns: int | None
+    ) -> Iterator[tuple[Callable[[int], str], ImuData]]:
         with (self.path / IMU).open("rb") as file:
-            first = 0
+            first = 0 if after_ns is None else self._first_block(file, after_ns)
+            file.seek(first * IMU_RECORD.itemsize)
             while len(rows := np.fromfile(file, IMU_RECORD, SAMPLES_PER_BLOCK)):
                 data = ImuData(*(np.ascontiguousarray(rows[n]) for n in ("stamp", "gyro", "accel")))
                 yield partial(_where, file.name, first), data
                 first += len(rows)
+
+    def _first_block(self, file: BinaryIO, after_ns: int) -> int:
+        """The first sample of the first block that ends at or after a time."""
+        first = 0
+        while first + SAMPLES_PER_BLOCK <= self._samples:
+            file.seek((first + SAMPLES_PER_BLOCK - 1) * IMU_RECORD.itemsize)
+            if np.fromfile(file, IMU_RECORD, 1)["stamp"][0] >= after_ns:
+                break
+            first += SAMPLES_PER_BLOCK
+        return first
 
     def frames(self, start_ns: int | None = None, end_ns: int | None = None) -> FrameStream:
         """The recorded frames, read one by one."""

@@ -20,7 +20,7 @@ from rosbags.rosbag2 import reader as ros2
 from rosbags.rosbag2 import storage_mcap as mcap
 from rosbags.rosbag2 import storage_sqlite3 as sqlite
 
-from slam_graph.settings.bounded_yaml import parse_value
+from slam_graph.settings import ConfigTree
 
 _RATIO = 50
 _LEAST = 2**26
@@ -63,7 +63,7 @@ class _BoundedYaml:
 @lru_cache(maxsize=4)
 def _yaml_value(text: str) -> Any:
     """The value of a text; a bag is opened several times, and nobody changes what it holds."""
-    return parse_value(text)[0]
+    return ConfigTree.value(text)
 
 
 class _BoundedFile:

@@ -13,11 +13,12 @@ import gtsam
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from slam_graph.arrays import FloatArray, lengths_of
+from slam_graph.arrays import FloatArray
 from slam_graph.datasets.rosbag.bag import Bag, Message
 from slam_graph.datasets.rosbag.messages import POSES, pose_of, pose_sigmas_of
 from slam_graph.datasets.rosbag.ros_topics import frame_of, path_between
 from slam_graph.datasets.streams.aiding_files import fixes_from, kept_of, known_poses_from
+from slam_graph.datasets.streams.vector_lengths import lengths_of
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import DataError
 from slam_graph.sensors import AidingData

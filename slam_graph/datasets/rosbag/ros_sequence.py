@@ -15,7 +15,6 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from slam_graph.arrays import lengths_of
 from slam_graph.datasets.calibration.kalibr_calibration import read_kalibr
 from slam_graph.datasets.rosbag.bag import REINDEX, Bag, Message
 from slam_graph.datasets.rosbag.messages import image_of, inertial_of, pose_of
@@ -34,6 +33,7 @@ from slam_graph.datasets.streams.image_sequence import (
 from slam_graph.datasets.streams.images import Fault, Image, prefetch
 from slam_graph.datasets.streams.imu_stream import clean_blocks
 from slam_graph.datasets.streams.pairing import ABSENT, Groups, in_order
+from slam_graph.datasets.streams.vector_lengths import lengths_of
 from slam_graph.errors import DataError
 from slam_graph.geometry import Trajectory
 from slam_graph.sensors import AidingData, ImuData, ImuNoise

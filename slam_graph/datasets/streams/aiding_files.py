@@ -27,10 +27,11 @@ from pathlib import Path
 
 import numpy as np
 
-from slam_graph.arrays import BoolArray, FloatArray, IntArray, lengths_of
+from slam_graph.arrays import BoolArray, FloatArray, IntArray
 from slam_graph.datasets.streams.csv_rows import LARGEST_STAMP_NS, Rows, read_rows
 from slam_graph.datasets.streams.geodesy import Datum, local_positions
 from slam_graph.datasets.streams.pairing import in_order
+from slam_graph.datasets.streams.vector_lengths import lengths_of
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import DataError
 from slam_graph.sensors import AidingData, Packet

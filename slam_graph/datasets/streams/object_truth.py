@@ -13,8 +13,8 @@ from pathlib import Path
 
 import numpy as np
 
-from slam_graph.arrays import lengths_of
 from slam_graph.datasets.streams.csv_rows import LARGEST_STAMP_NS, read_rows
+from slam_graph.datasets.streams.vector_lengths import lengths_of
 from slam_graph.errors import DataError
 from slam_graph.geometry import Trajectory
 
