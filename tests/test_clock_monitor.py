@@ -3,6 +3,7 @@
 """A clock that changes on the way: noticed, corrected, and the run goes on as if it had not."""
 
 from functools import cache
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ import pytest
 import slam_graph as sg
 from slam_graph.backend import BackendConfig
 from slam_graph.backend.initialization.clock_monitor import ClockChange
-from slam_graph.backend.initialization.start_calibration import StartCalibration
+from slam_graph.backend.initialization.start_calibration import FoundCalibration, StartCalibration
 from slam_graph.datasets.faults.injection import inject
 from slam_graph.datasets.sequence import RecordedSequence
 from slam_graph.evaluation import ape
@@ -21,17 +22,26 @@ from slam_graph.sensors import FeatureFrame, ImuBuffer, ImuData
 CHANGED_S = 9.0
 
 
-def flight(by_s: float | None = None, seed: int = 3, duration_s: float = 20.0) -> RecordedSequence:
+def flight(
+    by_s: float | None = None, seed: int = 3, duration_s: float = 20.0, **settings: Any
+) -> RecordedSequence:
     """Simulated stereo whose IMU is late (or early) from `CHANGED_S` on."""
-    made = sg.simulate(
-        trajectory="random", duration_s=duration_s, rate_hz=10.0, seed=seed, cameras=2
-    )
+    settings = {"rate_hz": 10.0, "cameras": 2, **settings}
+    made = sg.simulate(trajectory="random", duration_s=duration_s, seed=seed, **settings)
     return inject(made, [f"imu_late:at_s={CHANGED_S},by_s={by_s}"] if by_s else [])
 
 
-def changes(recording: RecordedSequence) -> list[tuple[float, ClockChange]]:
-    """Changes that are found in a recording, and when they are, s; no estimator takes part."""
+def found_in(
+    recording: RecordedSequence, done: bool = False
+) -> list[tuple[float, ClockChange | FoundCalibration]]:
+    """What is found in a recording, and when, s; no estimator takes part.
+
+    Args:
+        recording: of tracks.
+        done: whether the calibration counts as checked from the beginning.
+    """
     check, imu = StartCalibration(recording.rig, BackendConfig()), ImuBuffer()
+    check.done = done
     first_ns, found = recording.info().start_ns, []
     for packet in recording.packets():
         assert isinstance(packet.frame, FeatureFrame)
@@ -39,8 +49,14 @@ def changes(recording: RecordedSequence) -> list[tuple[float, ClockChange]]:
         at_s = (packet.frame.stamp_ns - first_ns) * 1e-9
         change = check.add(packet.frame, imu, started=at_s > 2.0)
         if change is not None:
-            assert isinstance(change, ClockChange)
             found.append((at_s, change))
+    return found
+
+
+def changes(recording: RecordedSequence, done: bool = False) -> list[tuple[float, ClockChange]]:
+    """Changes alone; nothing else is found."""
+    found = [(at, x) for at, x in found_in(recording, done) if isinstance(x, ClockChange)]
+    assert len(found) == len(found_in(recording, done))
     return found
 
 
@@ -69,9 +85,47 @@ def test_a_change_is_found_when_and_as_large_as_it_is(by_s: float, seed: int) ->
         assert 0 <= change.since_ns - begin_ns - round(by_s * 1e9) < 10_000_000
 
 
+@pytest.mark.parametrize("rate_hz", [5.0, 9.66, 12.0, 20.0])
+def test_a_change_is_found_later_as_well_whatever_the_rate(rate_hz: float) -> None:
+    """After the calibration was checked, by a few rotations a second."""
+    recording = flight(0.03, rate_hz=rate_hz)
+    at_s, change = changes(recording, done=True)[0]
+    assert CHANGED_S < at_s < CHANGED_S + 6.0
+    assert change.shift_s == pytest.approx(0.03, abs=1e-4)
+
+
 @pytest.mark.parametrize("seed", [1, 2, 3])
-def test_a_clock_that_stays_is_left_alone(seed: int) -> None:
-    assert not changes(flight(seed=seed, duration_s=30.0))
+@pytest.mark.parametrize("done", [False, True])
+def test_a_clock_that_stays_is_left_alone(seed: int, done: bool) -> None:
+    assert not changes(flight(seed=seed, duration_s=30.0), done)
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("by_s", [-0.009, 0.012])
+def test_an_offset_that_is_wrong_all_the_time_is_no_change(by_s: float, seed: int) -> None:
+    made = sg.simulate(trajectory="random", duration_s=20.0, rate_hz=10.0, seed=seed)
+    found = found_in(inject(made, [f"imu_late:at_s=0,by_s={by_s}"]))
+    assert all(isinstance(what, FoundCalibration) for _, what in found)
+
+
+def test_a_gyroscope_that_says_nothing_is_no_error() -> None:
+    recording = sg.simulate(trajectory="random", duration_s=15.0, rate_hz=10.0, seed=3)
+    check, imu = StartCalibration(recording.rig, BackendConfig()), ImuBuffer()
+    check.done = True
+    for packet in recording.packets():
+        assert isinstance(packet.frame, FeatureFrame)
+        samples = packet.imu
+        imu.add(ImuData(samples.stamps_ns, np.zeros_like(samples.gyro), samples.accel))
+        assert check.add(packet.frame, imu, started=True) is None
+
+
+def test_a_clock_that_was_corrected_at_the_start_may_change() -> None:
+    """What the start has found is found anew until it is known well."""
+    made = flight(None, seed=1, duration_s=26.0)
+    late = inject(made, ["imu_late:at_s=0,by_s=0.05", "imu_late:at_s=16,by_s=0.03"])
+    kinds = [type(what) for _, what in found_in(late)]
+    assert kinds[0] is FoundCalibration
+    assert ClockChange in kinds[1:]
 
 
 def test_samples_are_put_on_the_old_clock() -> None:
@@ -82,9 +136,9 @@ def test_samples_are_put_on_the_old_clock() -> None:
     change = ClockChange(530_000_000, 0, 0, 0.03, 0.001)
     corrected = change.corrected(samples)
     np.testing.assert_array_equal(corrected.stamps_ns, stamps)
-    early = ClockChange(500_000_000, 0, 0, -0.03, 0.001).corrected(corrected)
-    assert np.all(np.diff(early.stamps_ns) > 0)
-    assert len(early) == 200
+    too_much = ClockChange(530_000_000, 0, 0, 0.05, 0.001).corrected(samples)
+    assert np.all(np.diff(too_much.stamps_ns) > 0)
+    assert len(too_much) == 196  # four would be before the last sample on the old clock
 
 
 @pytest.mark.parametrize("algorithm", ["msckf", "fixed_lag_isam2"])

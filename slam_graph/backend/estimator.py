@@ -168,18 +168,20 @@ class Estimator(EstimatorKnowledge):
         self._given, self._start_mode = None, "auto"
         self._before, self._measured = before, measured
         change, self.clock_change = self.clock_change, None
-        frames = [] if change is None else change.after(self._check.recent)
+        recent, held, imu = list(self._check.recent), self._held or (), self._context.imu
+        frames: list[FeatureFrame] = []
         self._check.forget()
-        imu, self.states = self._context.imu, []
         if change is not None:
+            frames = [*change.after(recent), *held]
             self.clock_changes.append(change)
             imu.data = change.corrected(imu.data)
-            self._held = self._held or deque()
-        self._begin(imu)
-        if self._held is not None:
-            self._held.clear()
-            self._held.extend(frames)
-            self.states = self._take_held(self._held)
+        if change is not None or self._held is not None:
+            self._held = deque(frames)
+        self.states, self.replayed = [], None
+        with self._single_thread.held():
+            self._begin(imu)
+            if frames:
+                self.states = self._take_held()
 
     def add_imu(self, imu: ImuData) -> None:
         """Add IMU samples that follow those already given; others are counted and left out."""
@@ -221,14 +223,14 @@ class Estimator(EstimatorKnowledge):
                     self.states = [] if state is None else [state]
                 return state
             self._held.append(frame)
-            self.states = self._take_held(self._held)
+            self.states = self._take_held()
             return self._new(self.states)
 
     def finish(self) -> list[NavState]:
         """States at frames that still wait, when no more IMU samples come; in `states` too."""
         with self._single_thread.held():
             self.replayed = None
-            self.states = self._take_held(self._held or deque(), MAX_EARLY_NS)
+            self.states = self._take_held(MAX_EARLY_NS)
             return self.states
 
     def _take(self, frame: FeatureFrame) -> NavState | None:
@@ -286,7 +288,7 @@ class Estimator(EstimatorKnowledge):
         self.rig, self._corrected = found.rig, True
         if self.algorithm.engine == "square_root":  # GTSAM's smoothers take it as it is
             self._variables = found.variables
-        given, frames = self._given, list(self._check.recent)
+        given, frames = self._given, [*self._check.recent, *(self._held or ())]
         if given is not None and given.stamp_ns < frames[0].stamp_ns - _LEAD_NS:
             # the IMU alone would have to lead from there to here
             given, self._given, self._start_mode = None, None, "auto"
@@ -298,7 +300,7 @@ class Estimator(EstimatorKnowledge):
             if given is not None:
                 self.start(given)
             self._held = deque(frames)
-            states = self._take_held(self._held)
+            states = self._take_held()
             better = self.calibration
             if not rounds_left or better is None:
                 break
@@ -317,20 +319,18 @@ class Estimator(EstimatorKnowledge):
         self._output_ns = states[-1].stamp_ns
         return states[-1]
 
-    def _take_held(self, held: deque[FeatureFrame], early_ns: int = 0) -> list[NavState]:
+    def _take_held(self, early_ns: int = 0) -> list[NavState]:
         """States at the frames whose time the IMU has reached, or will within `early_ns`."""
         states: list[NavState] = []
-        variables = self._context.calibration
-        while held:
-            rig = self.rig if self.window is None else variables.rig(self.window.state.frames)
-            offset_ns = round(rig.cameras[0].clock_offset_s * 1e9)
-            if held[0].stamp_ns + offset_ns > self._context.imu.newest_ns() + early_ns:
+        while self._held:
+            offset_ns = round(self.rig_now.cameras[0].clock_offset_s * 1e9)
+            if self._held[0].stamp_ns + offset_ns > self._context.imu.newest_ns() + early_ns:
                 break
             corrected = self.replayed
-            state = self._take(held.popleft())
+            state = self._take(self._held.popleft())
             if self.replayed is not corrected:  # what came before is superseded
-                states[:] = (self.replayed or [])[:-1]
-            if state is not None:
+                states = list(self.replayed or ())
+            elif state is not None:
                 states.append(state)
         if self.replayed is not None:
             self.replayed = states

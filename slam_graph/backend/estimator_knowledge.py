@@ -144,9 +144,10 @@ class EstimatorKnowledge:
     @property
     def recorded_rig(self) -> Rig | None:
         """The corrected rig on the clock of the IMU samples as they come; None if nothing is."""
+        if not self.clock_changes:
+            return self.corrected_rig
         shift_s = sum(change.shift_s for change in self.clock_changes)
-        rig = self.rig.select(len(self._real_rig.cameras))
-        return rig.shifted(shift_s) if shift_s else self.corrected_rig
+        return self.rig.select(len(self._real_rig.cameras)).shifted(shift_s)
 
     @property
     def fix_calibration(self) -> AidingData.Calibration | None:

@@ -217,14 +217,14 @@ class Estimation:
             raise DivergenceError(
                 f"diverged at frame {stamp_ns}: the equations cannot be solved ({reason})"
             ) from error
-        if estimator.clock_change is not None and result.config.limits.recovery:
-            raise ClockError(estimator.clock_change)
         if estimator.replayed is not None:  # what was said of these frames so far is superseded
             self._recovery.supersede(estimator.replayed)
             result.corrected_rig = estimator.corrected_rig
             result.georeferenced = estimator.aiding.aligned
             if len(result.segments) < 2:
                 result.start_was_given &= estimator.start_is_given
+        if estimator.clock_change is not None and result.config.limits.recovery:
+            raise ClockError(estimator.clock_change)
         self._note_fixes()
         if state is not None:
             check_sane(state, result.config)

@@ -11,10 +11,18 @@ from __future__ import annotations
 from collections import deque
 from itertools import pairwise
 
+import numpy as np
+
 from slam_graph.backend import Estimator
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.geometry import NavState
-from slam_graph.pipeline.agreement import Agreement, ClockError, DivergenceError, JumpError
+from slam_graph.pipeline.agreement import (
+    Agreement,
+    ClockError,
+    DivergenceError,
+    JumpError,
+    check_sane,
+)
 from slam_graph.results import RunResult
 from slam_graph.sensors import ImuData
 
@@ -119,8 +127,15 @@ class Recovery:
         if self._short >= _MOST_SHORT:
             raise lost
         self._agreement = Agreement(result.config)
-        self._estimator.begin_segment(before, measured=not isinstance(lost, JumpError))
+        measured = not isinstance(lost, JumpError)
         self._diagnostics.warn("new_segment", f"{lost}; the run starts again from here")
+        try:
+            self._estimator.begin_segment(before, measured)
+            for state in self._estimator.states:
+                check_sane(state, result.config)
+        except (DivergenceError, RuntimeError, np.linalg.LinAlgError):
+            # not with the frames that were there already: with those that follow
+            self._estimator.begin_segment(before, measured)
         self.append(self._estimator.states)
 
     def _good_until(self, lost: DivergenceError) -> int | None:

@@ -21,31 +21,29 @@ from slam_graph.backend.initialization.gyro_alignment import (
     GyroAlignment,
     Turns,
     align_gyroscope,
+    log_likelihood_ratios,
     offset_step,
-    preference,
 )
 from slam_graph.sensors import FeatureFrame, ImuBuffer, ImuData, RigCamera
 
-_CLEAR = 30.0
-"""Smallest margin of the minimum: the second best has a probability of exp(-30) of the best."""
-_MAX_MISFIT = 30.0
-"""Rotations that fit worse, in units of their information, are of something else than offsets."""
-_KNOWN_SIGMA_S, _AGREES_SIGMAS = 5e-3, 3.0
-"""An offset that is known to this, and agrees with the calibration within so many standard
-deviations, confirms it."""
-_SUSPECT_SIGMAS = 4.0
-"""A linear look that shows more than this is followed by one over all offsets."""
+_FIRST_SIGMA_S, _KNOWN_SIGMA_S = 5e-3, 3e-3
+"""An offset is taken from rotations that show it to this; it is found anew until it is known to
+that."""
+_AGREES_SIGMAS = 3.0
+"""Two offsets are the same if they differ by fewer standard deviations."""
+_DIFFERS_SIGMAS = 4.0
+"""A Gauss-Newton step that is larger is followed by a search over all offsets."""
 _CHANGED_SIGMAS, _CHANGED_S, _CHANGED_SIGMA_S = 8.0, 8e-3, 4e-3
 """The clock has changed if the offset differs by so many standard deviations, by so much, and is
 known to this. Good recordings show up to 3.2 standard deviations."""
+_APART_SIGMAS = 5.0
+"""It must also differ by so many of both estimates, before and now."""
 _FEWEST_AFTER = 15
 """Fewest rotations after the change of which the new offset is taken."""
 _AFTER_NS = 100_000_000
 """The new beginning keeps this far from the time of the change."""
-_NEAR_NS = 1_000_000_000
-"""A gap in the samples this near to the change is where it happened."""
-_SAME_SIGMAS = 3.0
-"""Such a gap is as long as the change if the two differ by fewer standard deviations."""
+_GAP_NEAR_NS = 1_000_000_000
+"""A gap in the samples that is this near to the change, and as long, is where it happened."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,7 +70,7 @@ class ClockChange:
         later = "later" if self.shift_s > 0.0 else "earlier"
         return (
             f"the clock of the IMU is {1e3 * abs(self.shift_s):.1f} ± {1e3 * self.sigma_s:.1f} ms "
-            f"{later} against the cameras since {self.since_ns}"
+            f"{later} against the cameras since {self.since_ns} ns"
         )
 
     def corrected(self, imu: ImuData) -> ImuData:
@@ -101,66 +99,73 @@ class ClockMonitor:
         camera: the first of the rig, as calibrated; its rotation on the body is known.
         known: its time offset as it was found, and the standard deviation of that, s; None if
             only the calibration says it.
+
+    Attributes:
+        agrees: whether the last estimate agrees with those before.
     """
 
     def __init__(self, camera: RigCamera, known: tuple[float, float] | None = None) -> None:
         self._R = camera.body_T_camera.rotation().matrix()
         self._nominal_s = camera.clock_offset_s
         self._known = known
+        self.agrees = False
 
-    def suspects(self, turns: Turns, imu: ImuData) -> bool:
-        """Whether rotations need a closer look: they show another offset, or none is known yet.
+    def needs_estimate(self, turns: Turns, imu: ImuData) -> bool:
+        """Whether few rotations show another offset than before, or it is not known well yet.
 
         Args:
             turns: a few rotations over the last seconds.
             imu: samples that cover them.
         """
-        if self._known is None:
+        if self._known is None or self._known[1] > _KNOWN_SIGMA_S:
             return True
         offset_s, sigma_s = self._known
         step_s, step_sigma_s = offset_step(turns, imu, self._R, offset_s)
-        return abs(step_s) > _SUSPECT_SIGMAS * float(np.hypot(step_sigma_s, sigma_s))
+        return abs(step_s) > _DIFFERS_SIGMAS * float(np.hypot(step_sigma_s, sigma_s))
 
-    def look(self, covered: tuple[Turns, ImuData], imu: ImuBuffer) -> ClockChange | None:
-        """Find the offset of the last seconds, and the change if it contradicts what was known.
+    def estimate(self, covered: tuple[Turns, ImuData], imu: ImuBuffer) -> ClockChange | None:
+        """Estimate the offset of the last seconds; the change if it contradicts that before.
 
         Args:
             covered: rotations as close together as at the start, and samples that cover them.
             imu: all recent samples.
         """
         found = align_gyroscope(*covered, self._R, self._nominal_s)
-        return None if found is None else self.judge(found, covered, imu)
+        self.agrees = False
+        if found is None or not found.is_clear():
+            return None
+        return self.compare(found, covered, imu)
 
-    def judge(
+    def compare(
         self, found: GyroAlignment, covered: tuple[Turns, ImuData], imu: ImuBuffer
     ) -> ClockChange | None:
-        """The change, if what was found contradicts what was known before.
+        """The change, if an estimate contradicts those before; if it agrees the better one is kept.
 
         Args:
-            found: offset of the last seconds.
+            found: clear estimate of the offset over the last seconds.
             covered: the rotations of these, and samples that cover them.
             imu: all recent samples.
         """
-        if found.margin < _CLEAR or found.misfit > _MAX_MISFIT:
-            return None
-        sigma_s = found.offset_sigma_s
+        offset_s, sigma_s = found.offset_s, found.offset_sigma_s
         if self._known is None:
-            if sigma_s < _KNOWN_SIGMA_S:
-                self._know(found)
+            if sigma_s < _FIRST_SIGMA_S:
+                self._known = offset_s, sigma_s
             return None
-        before_s, before_sigma_s = self._known
-        change_s = found.offset_s - before_s
-        limit_s = max(_CHANGED_S, _CHANGED_SIGMAS * float(np.hypot(sigma_s, before_sigma_s)))
-        if sigma_s > _CHANGED_SIGMA_S or abs(change_s) < limit_s:
+        known_s, known_sigma_s = self._known
+        both_s = float(np.hypot(sigma_s, known_sigma_s))
+        self.agrees = abs(offset_s - known_s) < _AGREES_SIGMAS * both_s
+        if self.agrees and sigma_s < known_sigma_s:
+            self._known = offset_s, sigma_s
+        confirmed = abs(known_s - self._nominal_s) < _AGREES_SIGMAS * known_sigma_s
+        before_s = self._nominal_s if confirmed else known_s
+        limit_s = max(_CHANGED_S, _CHANGED_SIGMAS * (sigma_s if confirmed else both_s))
+        if (
+            sigma_s > _CHANGED_SIGMA_S
+            or abs(offset_s - known_s) < _APART_SIGMAS * both_s
+            or abs(offset_s - before_s) < limit_s
+        ):
             return None
         return _change(found, before_s, covered, imu, self._R)
-
-    def _know(self, found: GyroAlignment) -> None:
-        """Take the calibrated offset as confirmed, or that which was found as known."""
-        away_s = abs(found.offset_s - self._nominal_s)
-        confirmed = away_s < _AGREES_SIGMAS * found.offset_sigma_s
-        known_s = self._nominal_s if confirmed else found.offset_s
-        self._known = known_s, 0.0 if confirmed else found.offset_sigma_s
 
 
 def _change(
@@ -170,12 +175,12 @@ def _change(
     imu: ImuBuffer,
     R: FloatArray,
 ) -> ClockChange | None:
-    """When and by how much the offset has changed; None if it was another one all the time."""
+    """When and by how much the offset has changed; None if all rotations fit the old one better."""
     turns, samples = covered
-    preferred = preference(turns, samples, R, found.gyro_bias, (before_s, found.offset_s))
+    ratios = log_likelihood_ratios(turns, samples, R, found.gyro_bias, (before_s, found.offset_s))
     # the rotations before the split fit the old offset better, the others the new one
-    split = int(np.argmin(np.append(0.0, np.cumsum(preferred))))
-    if split == len(preferred):
+    split = int(np.argmin(np.append(0.0, np.cumsum(ratios))))
+    if split == len(ratios):
         return None
     good_ns, first_ns = int(turns.first_ns[split]), int(turns.second_ns[split])
     after = turns.first_ns >= first_ns
@@ -204,14 +209,14 @@ def _gap(
         intervals differ (s); None if there is no such gap.
     """
     stamps = imu.stamps_ns
-    around = stamps[(stamps > near_ns - _NEAR_NS) & (stamps < near_ns + _NEAR_NS)]
+    around = stamps[(stamps > near_ns - _GAP_NEAR_NS) & (stamps < near_ns + _GAP_NEAR_NS)]
     if len(around) < 2:
         return None
     intervals_s = np.diff(around) * 1e-9
     usual_s = float(np.median(intervals_s))
     largest = int(np.argmax(intervals_s))
     longer_s = float(intervals_s[largest]) - usual_s
-    if longer_s < usual_s or abs(longer_s - change_s) > _SAME_SIGMAS * sigma_s:
+    if longer_s < usual_s or abs(longer_s - change_s) > _AGREES_SIGMAS * sigma_s:
         return None
     jitter_s = float(np.median(np.abs(intervals_s - usual_s)))
     return int(around[largest + 1]), longer_s, jitter_s

@@ -25,6 +25,10 @@ from slam_graph.sensors import ImuData
 
 MAX_OFFSET_S = 0.12
 """Largest time offset that is looked for, of either sign."""
+CLEAR = 30.0
+"""Smallest margin of a minimum: the second best has a probability of exp(-30) of the best."""
+_MAX_MISFIT = 30.0
+"""Rotations that fit worse, in units of their information, are of something else than offsets."""
 _COARSE_S, _FINE_S = 5e-3, 1e-3
 """Steps of the two grids."""
 _BIAS_SIGMA = 0.1
@@ -91,6 +95,10 @@ class GyroAlignment:
     body_R_camera: FloatArray
     rotation_sigma_rad: float
     misfit: float
+
+    def is_clear(self, margin: float = CLEAR) -> bool:
+        """Whether the minimum is the only one, and the rotations are of the body."""
+        return self.margin >= margin and self.misfit <= _MAX_MISFIT
 
 
 class _Gyroscope:
@@ -180,13 +188,14 @@ def _robust_least_squares(
 
     Args:
         r: (D, K, 3).
-        J: (D, K, 3, n), by the gyroscope bias and the mounting, if that is estimated.
+        J: (D, K, 3, n), by the gyroscope bias and the mounting or the offset, if one is estimated.
         scale: variance of the residuals in units of their information; None to measure it.
 
     Returns:
         Cost (D,), unknowns (D, n), their information (D, n, n), and the scale (D,).
     """
-    prior = np.diag([_BIAS_SIGMA**-2] * 3 + [0.0] * (J.shape[-1] - 3))
+    others = [MAX_OFFSET_S**-2] if J.shape[-1] == 4 else [0.0] * (J.shape[-1] - 3)
+    prior = np.diag([_BIAS_SIGMA**-2] * 3 + others)
     D, K, _, n = J.shape
     J, r = J.reshape(D, 3 * K, n), r.reshape(D, 3 * K)
     weights = np.ones((D, K))
@@ -279,14 +288,14 @@ def offset_step(
     return float(x[0, 3]), _CORRELATION * float(np.sqrt(variance))
 
 
-def preference(
+def log_likelihood_ratios(
     turns: Turns,
     imu: ImuData,
     body_R_camera: FloatArray,
     gyro_bias: FloatArray,
     offsets_s: tuple[float, float],
 ) -> FloatArray:
-    """How much better each of the rotations (K,) fits the second of two time offsets.
+    """How much likelier each of the rotations (K,) is under the second of two time offsets.
 
     Args:
         turns: rotations of the camera.
@@ -296,8 +305,7 @@ def preference(
         offsets_s: t_imu - t_camera.
 
     Returns:
-        (K,) difference of robust costs, in half squared standard deviations; negative where the
-        first offset fits better.
+        (K,) logarithms of the robust likelihood ratio; negative where the first is likelier.
     """
     problem = _Problem(turns, imu)
     body = problem.body_turns(np.array(offsets_s))

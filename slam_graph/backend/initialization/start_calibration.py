@@ -4,7 +4,8 @@
 
 Rotations of the first camera are compared with the gyroscope (`gyro_alignment.py`) until the time
 offset is known well enough to say that it fits, or that it does not. At rest nothing is seen, so
-that this goes on after a start at rest.
+that this goes on after a start at rest. From then on a few rotations a second tell whether the
+clock changes (`clock_monitor.py`).
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ import numpy as np
 from slam_graph.backend.backend_config import BackendConfig, CalibrationConfig
 from slam_graph.backend.initialization.clock_monitor import ClockChange, ClockMonitor
 from slam_graph.backend.initialization.gyro_alignment import (
+    CLEAR,
     GyroAlignment,
     align_gyroscope,
     turns_contradict,
@@ -28,16 +30,14 @@ from slam_graph.sensors import FeatureFrame, ImuBuffer, Rig
 _SPACING_NS, _LATER_SPACING_NS = 45_000_000, 360_000_000
 """Smallest time between two frames that are used, at the start and later."""
 _LATER_TURNS = 10
-"""Fewest rotations for a look at the clock later."""
+"""Fewest rotations for a test of the clock later."""
 _RETRY_NS, _LATER_RETRY_NS, _LATER_PAUSE_NS = 400_000_000, 900_000_000, 5_000_000_000
-"""Time between two estimates at the start, two looks at the clock later, and after a close one."""
+"""Time between two estimates at the start, between two tests of the clock later, and after one
+that an estimate did not confirm."""
 _RECENT_NS = 6_000_000_000
 """How long frames are kept to begin anew from."""
-_CLEAR, _CLEAR_WAITING = 30.0, 15.0
-"""Smallest margin of the minimum: the second best has a probability of exp(-30) of the best. Less
-is enough as long as there is no state that could be lost."""
-_MAX_MISFIT = 30.0
-"""Rotations that fit worse, in units of their information, are of something else than offsets."""
+_CLEAR_WAITING = 15.0
+"""Smallest margin of a minimum as long as there is no state that could be lost."""
 _ADOPTED_SIGMAS, _ADOPTED_S = 8.0, 4e-3
 """An offset is adopted if it differs by more standard deviations, and by more. One of some hundred
 starts with a right clock came to 6.6."""
@@ -73,10 +73,10 @@ class FoundCalibration:
 
 
 class StartCalibration:
-    """Compares the first camera with the gyroscope until it is known whether its calibration fits.
+    """Compares the first camera with the gyroscope: does its calibration fit, and does it stay so?
 
     Attributes:
-        done: whether there is nothing left to find out.
+        done: whether it is known if the calibration fits.
         mounted: whether the rotation of the cameras on the body is known, by calibration or now.
         recent: frames of the last seconds, from which one can begin anew.
         waiting_for: what an estimate still needs.
@@ -132,29 +132,30 @@ class StartCalibration:
             return None
         R = self._camera.body_T_camera.rotation().matrix() if self.mounted else None
         found = align_gyroscope(*covered, R, self._camera.clock_offset_s)
-        clear = _CLEAR if started else _CLEAR_WAITING
-        if found is None or found.margin < clear or found.misfit > _MAX_MISFIT:
+        if found is None or not found.is_clear(CLEAR if started else _CLEAR_WAITING):
             return None
-        change = None if monitor is None else monitor.judge(found, covered, imu)
+        change = None if monitor is None else monitor.compare(found, covered, imu)
         return change or self._judged(found, _ADOPTED_SIGMA_S if started else _WAITING_SIGMA_S)
 
     def _watch(
         self, frame: FeatureFrame, imu: ImuBuffer, monitor: ClockMonitor | None
     ) -> ClockChange | None:
-        """A change of the clock since the start; few rotations tell whether to look closely."""
-        self._turns.add(frame, imu, self.mounted, _LATER_SPACING_NS)
+        """A change of the clock since the start; few rotations tell whether to estimate it."""
+        self._turns.add(frame, imu, self.mounted, _LATER_SPACING_NS, keep_last=True)
         if monitor is None or frame.stamp_ns < self._next_ns:
             return None
         self._next_ns = frame.stamp_ns + _LATER_RETRY_NS
         covered = self._turns.covered(imu, _LATER_TURNS)
-        if covered is None or not monitor.suspects(*covered):
+        if covered is None or not monitor.needs_estimate(*covered):
             return None
-        self._next_ns = frame.stamp_ns + _LATER_PAUSE_NS
         turns = VisualTurns(self._camera, self._config.noise.pixel_sigma)
         for before in self.recent:
             turns.add(before, imu, self.mounted, _SPACING_NS)
         covered = turns.covered(imu)
-        return None if covered is None else monitor.look(covered, imu)
+        change = None if covered is None else monitor.estimate(covered, imu)
+        if monitor.agrees:
+            self._next_ns = frame.stamp_ns + _LATER_PAUSE_NS
+        return change
 
     def contradiction(self, imu: ImuBuffer) -> str | None:
         """What of mounting or units the rotations of the last seconds contradict, if anything."""

@@ -49,7 +49,14 @@ class VisualTurns:
         self._frames.clear()
         self._turns.clear()
 
-    def add(self, frame: FeatureFrame, imu: ImuBuffer, mounted: bool, spacing_ns: int) -> None:
+    def add(
+        self,
+        frame: FeatureFrame,
+        imu: ImuBuffer,
+        mounted: bool,
+        spacing_ns: int,
+        keep_last: bool = False,
+    ) -> None:
         """Take the next frame, unless it follows the last one too soon.
 
         Args:
@@ -57,9 +64,11 @@ class VisualTurns:
             imu: samples so far.
             mounted: whether the rotation of the camera on the body is known.
             spacing_ns: smallest time between two frames that are used.
+            keep_last: whether a rotation may be over up to twice the usual time, if there is no
+                other frame: where the spacing is nearly as long as that.
         """
         if not self._frames or frame.stamp_ns - self._frames[-1].stamp_ns >= spacing_ns:
-            self._add(self._unrolled(frame, imu) if mounted else frame)
+            self._add(self._unrolled(frame, imu) if mounted else frame, keep_last)
 
     def _unrolled(self, frame: FeatureFrame, imu: ImuBuffer) -> FeatureFrame:
         """The frame with the first camera's bearings at the time of its middle row."""
@@ -80,9 +89,12 @@ class VisualTurns:
         turned = replace(seen, normalized=normalized)
         return FeatureFrame(frame.stamp_ns, (turned, *frame.cameras[1:]))
 
-    def _add(self, frame: FeatureFrame) -> None:
+    def _add(self, frame: FeatureFrame, keep_last: bool) -> None:
         """The rotation since the oldest frame with enough of the same features."""
-        while self._frames and frame.stamp_ns - self._frames[0].stamp_ns > _BASELINE_NS:
+        while self._frames:
+            longest_ns = 2 * _BASELINE_NS if keep_last and len(self._frames) == 1 else _BASELINE_NS
+            if frame.stamp_ns - self._frames[0].stamp_ns <= longest_ns:
+                break
             self._frames.popleft()
         while self._turns and frame.stamp_ns - self._turns[0][0] > _WINDOW_NS:
             self._turns.popleft()

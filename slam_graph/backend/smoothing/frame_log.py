@@ -39,6 +39,8 @@ _MAX_BEYOND_NS = 100_000_000
 """Frames farther outside of the IMU samples than this are left out."""
 _SPACING_WITHOUT_IMU_S = 0.05
 """Longest time between keyframes without an IMU, which else tells the motion between them."""
+_AROUND_NS = 200_000_000
+"""Samples so much earlier are read where the clock of the IMU has become earlier."""
 _JITTER = 0.95
 """Part of the keyframe spacing that is enough, because time stamps jitter."""
 
@@ -78,7 +80,6 @@ class FrameLog:
         self._frames = array("q")
         self._keyframes = array("q")  # numbers of frames
         self._noise = array("d")
-        self._first_ns = 0
         self._lead_ns = round(rig.end_offset_s * 1e9)
         self._imu: list[ImuData] = []
         self._imu_ns: tuple[int, int] | None = None
@@ -143,8 +144,6 @@ class FrameLog:
         if self._is_keyframe(frame):
             self._keyframes.append(len(self._frames))
             self._last_ids = cameras[0].ids
-        if not self._frames:
-            self._first_ns = frame.stamp_ns
         self._frames.append(frame.stamp_ns)
         self._noise.extend(noise)
 
@@ -189,19 +188,30 @@ class FrameLog:
 
     def packets(self, first: int, stop: int, rig: Rig) -> Iterator[Packet]:
         """Frames `first` to `stop - 1`, each with the samples since the one before."""
+        shift_s = sum(change.shift_s for change in self.clock_changes)
         sequence = self._recorded
-        sequence.rig = replace(rig, has_imu=True)  # it says how far the samples lead
-        yield from sequence.packets(self._frames[first], self._frames[stop - 1])
+        sequence.rig = replace(rig.shifted(max(0.0, shift_s)), has_imu=True)  # how far samples lead
+        begin_ns = self._frames[first]
+        # samples of a clock that became earlier are of frames before
+        earlier_ns = begin_ns if shift_s >= 0.0 else begin_ns + round(shift_s * 1e9) - _AROUND_NS
+        before: list[ImuData] = []
+        newest_ns = np.iinfo(np.int64).min
+        for packet in sequence.packets(earlier_ns, self._frames[stop - 1]):
+            before.append(packet.imu)
+            if packet.frame.stamp_ns < begin_ns:
+                continue
+            imu = ImuData.concatenate(before)
+            for change in self.clock_changes:
+                imu = change.corrected(imu)
+            imu = imu[int(np.searchsorted(imu.stamps_ns, newest_ns, side="right")) :]
+            newest_ns = int(imu.stamps_ns[-1]) if len(imu) else newest_ns
+            yield replace(packet, imu=imu)
+            before = []
 
     @cached_property
     def _recorded(self) -> RecordedSequence:
         """All frames as they were recorded: opened once, as its index is that of the whole run."""
-        # a change of the clock is undone by the fault that is its opposite
-        undone = [
-            f"imu_late:at_s={(change.since_ns - self._first_ns) * 1e-9!r},by_s={-change.shift_s!r}"
-            for change in self.clock_changes
-        ]
-        return open_dataset(self._path, "recording", diagnostics=_Silent(), faults=undone)
+        return open_dataset(self._path, "recording", diagnostics=_Silent())
 
     def _follows(self, frame_ns: int) -> bool:
         """Whether a frame is later than the others and within the IMU samples."""
