@@ -345,6 +345,14 @@ def bag_of_type(path: Path, definition: str) -> Path:
     return path
 
 
+def doubling(levels: int) -> str:
+    """A message type of two of the next type each."""
+    types = [f"a/T{k} one\na/T{k} two" for k in range(levels)]
+    heads = [f"{'=' * 80}\nMSG: a/T{k}\n" for k in range(levels)]
+    bodies = [*types[1:], "uint8 end"]
+    return "\n".join([types[0], *(head + body for head, body in zip(heads, bodies, strict=True))])
+
+
 @pytest.mark.parametrize(
     "definition",
     [
@@ -352,6 +360,8 @@ def bag_of_type(path: Path, definition: str) -> Path:
         f"std_msgs/Header[300000] headers\n{'=' * 80}\nMSG: std_msgs/Header\nuint8 sequence",
         "sensor_msgs/Imu itself",
         "uint8[4000000000] numbers",
+        f"std_msgs/Empty[] many\n{'=' * 80}\nMSG: std_msgs/Empty\n",
+        pytest.param(doubling(22), id="doubling"),
     ],
 )
 def test_a_type_that_claims_long_arrays_is_refused(tmp_path: Path, definition: str) -> None:

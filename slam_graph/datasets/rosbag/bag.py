@@ -216,27 +216,53 @@ def _types_of(path: Path, reader: Reader1 | Reader2) -> Typestore:
 
 _LONGEST_ARRAY = 1000
 """Of strings or messages, in a message type. For each element there are lines of compiled code."""
+_MOST_MEMBERS = 20_000
+"""Of a message type and all that it is made of."""
 
 
 def _check_arrays(types: Typestore, msgtype: str) -> None:
-    """Refuse a type whose compiled code would be long: `Header[1000000000]` is 20 bytes in a bag.
+    """Refuse a type that costs far more than its definition or its messages are long.
+
+    `Header[1000000000]` is 20 bytes in a bag and as many lines of compiled code; so are types that
+    hold two of the next type each. A sequence of what takes no bytes may be of any length.
 
     Raises:
-        ValueError: if it has such an array, itself or in a type that it is made of.
+        ValueError: if it has such a member, itself or in a type that it is made of.
     """
+    _size_of_type(types, msgtype, {})
+
+
+def _size_of_type(
+    types: Typestore, msgtype: str, known: dict[str, tuple[int, int] | None]
+) -> tuple[int, int]:
+    """How many members a type has, in all types that it is made of, and its least bytes."""
     from rosbags.interfaces import Nodetype
 
-    known, waiting = {msgtype}, [msgtype]
-    while waiting:
-        for name, (kind, what) in types.fielddefs[waiting.pop()][1]:
-            length: Any = what[1] if kind == Nodetype.ARRAY else 0
-            inner: Any = what[0] if kind in (Nodetype.ARRAY, Nodetype.SEQUENCE) else (kind, what)
-            is_number = inner[0] == Nodetype.BASE and inner[1][0] != "string"
-            if length > _LONGEST_ARRAY and not is_number:
-                raise ValueError(f"{name} in messages of type {msgtype} is an array of {length}")
-            if inner[0] == Nodetype.NAME and inner[1] not in known:
-                known.add(inner[1])
-                waiting.append(inner[1])
+    found = known.get(msgtype, (0, 0))
+    if found is None:
+        raise ValueError(f"messages of type {msgtype} contain themselves")
+    if msgtype in known:
+        return found
+    known[msgtype] = None
+    members, least = 0, 0
+    for name, (kind, what) in types.fielddefs[msgtype][1]:
+        listed = kind in (Nodetype.ARRAY, Nodetype.SEQUENCE)
+        length: Any = what[1] if kind == Nodetype.ARRAY else 1
+        inner: Any = what[0] if listed else (kind, what)
+        is_text = inner[0] == Nodetype.BASE and inner[1][0] == "string"
+        size = (1, 4 if is_text else 1)
+        if inner[0] == Nodetype.NAME:
+            size = _size_of_type(types, inner[1], known)
+        if length > _LONGEST_ARRAY and (is_text or inner[0] == Nodetype.NAME):
+            raise ValueError(f"{name} in messages of type {msgtype} is an array of {length}")
+        if kind == Nodetype.SEQUENCE and size[1] == 0:
+            raise ValueError(f"{name} in messages of type {msgtype} is a sequence of nothing")
+        members += 1 + (length if inner[0] == Nodetype.NAME else 1) * size[0]
+        least += 4 if kind == Nodetype.SEQUENCE else length * size[1]
+        if members > _MOST_MEMBERS:
+            raise ValueError(f"messages of type {msgtype} have more than {_MOST_MEMBERS} members")
+    known[msgtype] = members, least
+    return members, least
 
 
 @cache
