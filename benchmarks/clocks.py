@@ -32,7 +32,7 @@ class Watch:
     """
 
     def __init__(self) -> None:
-        self.wall = array("d")  # of boxed floats, a long run's times would take more than its logs
+        self.wall = array("d")  # 8 bytes a time: a long run has many
         self.cpu = array("d")
         self.start()
 

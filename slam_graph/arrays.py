@@ -27,7 +27,7 @@ _ROWS_PER_BLOCK = 1024
 
 
 class GrowingTable:
-    """Rows of as many numbers each, which grow one by one, in blocks that never move.
+    """Rows of the same width, which are added one by one, in blocks that never move.
 
     One array that grows moves to a larger place again and again. Between what else is allocated
     meanwhile it leaves holes of its size, which stay in the memory of the process.
@@ -49,7 +49,7 @@ class GrowingTable:
         """Add a row (width,)."""
         place = self._count % _ROWS_PER_BLOCK
         if place == 0:
-            self._blocks.append(np.empty((_ROWS_PER_BLOCK, self._width), self._dtype))
+            self._blocks.append(np.zeros((_ROWS_PER_BLOCK, self._width), self._dtype))
         self._blocks[-1][place] = row
         self._count += 1
 
@@ -69,7 +69,7 @@ class GrowingTable:
             block[max(first - number * _ROWS_PER_BLOCK, 0) :, columns] = value
 
     def rows(self) -> NDArray[Any]:
-        """(N, width) a copy of all rows."""
+        """(N, width) all rows, in an array of their own."""
         if not self._blocks:
             return np.empty((0, self._width), self._dtype)
         return np.concatenate(self._blocks)[: self._count]

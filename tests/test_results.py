@@ -15,6 +15,7 @@ import pytest
 
 from slam_graph.arrays import GrowingTable
 from slam_graph.backend import Estimator
+from slam_graph.backend.cost.gating import Innovations
 from slam_graph.backend.engine_protocol import StepReport
 from slam_graph.config import load_config
 from slam_graph.datasets.groundtruth import read_groundtruth
@@ -122,7 +123,9 @@ def test_frame_table_has_a_cost_for_each_step_that_was_ever_taken() -> None:
     table, seen = FrameTable(), FeatureObservations.empty()
     given: list[tuple[float, ...]] = [(), (8.0, 4.0), (9.0, 3.0, 1.0), (7.0, 6.0)]
     for stamp_ns, costs in enumerate(given):
-        estimator = cast(Estimator, SimpleNamespace(window=None, report=StepReport(costs=costs)))
+        report = StepReport(costs=costs)
+        report.innovations = Innovations(tested=1, passed_distance=2.0, passed_dof=2, expected=2.0)
+        estimator = cast(Estimator, SimpleNamespace(window=None, report=report))
         table.append(FeatureFrame(stamp_ns, (seen,)), 0, estimator, {})
     none = np.zeros(0, np.int64)
     rows = list(csv.DictReader(table.csv_lines(none, None)))
@@ -139,6 +142,7 @@ def test_frame_table_has_a_cost_for_each_step_that_was_ever_taken() -> None:
     assert [row["cost_before"] for row in rows] == ["", "8", "", ""]
     assert "cost_after_2" not in rows[0]
     assert [row["tracked"] for row in rows] == ["0"] * 4
+    assert [row["nis"] for row in rows] == ["2", "2", "", ""]
 
 
 def test_growing_table_is_what_one_array_would_be() -> None:

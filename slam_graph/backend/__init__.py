@@ -16,6 +16,7 @@ __all__ = [
     "FeaturePolicy",
     "FinalBa",
     "FinalBaConfig",
+    "FrameLog",
     "GainRatioDamping",
     "Innovations",
     "MovingObjects",
@@ -51,6 +52,7 @@ if TYPE_CHECKING:
     from slam_graph.backend.objects.objects_config import ObjectsConfig
     from slam_graph.backend.policies import AlgorithmConfig
     from slam_graph.backend.smoothing.final_adjustment import FinalBa
+    from slam_graph.backend.smoothing.frame_log import FrameLog
     from slam_graph.backend.smoothing.object_smoothing import ObjectSmoother
     from slam_graph.backend.smoothing.smoothing_config import FinalBaConfig
     from slam_graph.backend.solve.damped_steps import (
@@ -82,6 +84,7 @@ else:
             "objects.objects_config": ("ObjectsConfig",),
             "policies": ("AlgorithmConfig",),
             "smoothing.final_adjustment": ("FinalBa",),
+            "smoothing.frame_log": ("FrameLog",),
             "smoothing.object_smoothing": ("ObjectSmoother",),
             "smoothing.smoothing_config": ("FinalBaConfig",),
             "solve.damped_steps": (

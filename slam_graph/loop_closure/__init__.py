@@ -13,7 +13,6 @@ from slam_graph.lazy import lazy_exports
 
 __all__ = [
     "Keyframe",
-    "KeyframeDescriber",
     "KeyframeLog",
     "Loop",
     "LoopClosureConfig",
@@ -27,7 +26,7 @@ __all__ = [
 if TYPE_CHECKING:
     from slam_graph.loop_closure.loop_closing import LoopClosures, close_loops
     from slam_graph.loop_closure.loop_config import LoopClosureConfig
-    from slam_graph.loop_closure.loop_keyframes import Keyframe, KeyframeDescriber, KeyframeLog
+    from slam_graph.loop_closure.loop_keyframes import Keyframe, KeyframeLog
     from slam_graph.loop_closure.loop_pose_graph import correct_keyframes
     from slam_graph.loop_closure.loop_verification import Loop, LoopVerifier
     from slam_graph.loop_closure.place_recognition import Vocabulary
@@ -42,7 +41,6 @@ else:
             "loop_config": ("LoopClosureConfig",),
             "loop_keyframes": (
                 "Keyframe",
-                "KeyframeDescriber",
                 "KeyframeLog",
             ),
             "loop_pose_graph": ("correct_keyframes",),

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import TypeAlias
 
 import cv2
 import gtsam
@@ -141,6 +142,8 @@ class KeyframeLog:
     Attributes:
         keyframes: so far.
     """
+
+    Describer: TypeAlias = KeyframeDescriber
 
     def __init__(self, rig: Rig, config: KeyframeConfig) -> None:
         self.keyframes: list[Keyframe] = []

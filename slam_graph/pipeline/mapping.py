@@ -19,7 +19,7 @@ from slam_graph.datasets import Sequence
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import DataError
 from slam_graph.geometry import NavState, Trajectory
-from slam_graph.loop_closure import Keyframe, KeyframeDescriber, KeyframeLog, Loop, close_loops
+from slam_graph.loop_closure import Keyframe, KeyframeLog, Loop, close_loops
 from slam_graph.maps import MapLocalizer, MapRecording, SlamMap, build_map
 from slam_graph.pipeline.stage import COMPLETED, EstimatedFrame, Stage, warn_on_failure
 from slam_graph.pose_graph import Poses
@@ -227,7 +227,7 @@ class Localization(Stage):
     def __init__(self, result: RunResult, known: SlamMap, diagnostics: Diagnostics) -> None:
         loops, self._result, self._known = result.config.loop_closure, result, known
         camera = result.input.rig.cameras[0].camera
-        self._describer = KeyframeDescriber(camera, loops.keyframes.further_corners)
+        self._describer = KeyframeLog.Describer(camera, loops.keyframes.further_corners)
         self._localizer = self._new_localizer()
         self._name, self._diagnostics = result.input.info.name, diagnostics
         self._log = result.begin_localization(known)

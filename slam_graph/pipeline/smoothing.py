@@ -40,7 +40,7 @@ class Smoothing(Stage):
         self._progress = progress
         self._diagnostics = diagnostics
         self._recording = ExitStack()
-        self._log: backend.FinalBa.Log | None = None
+        self._log: backend.FrameLog | None = None
 
     def begin(self, resources: ExitStack) -> None:
         """Make the temporary folder."""
@@ -48,7 +48,7 @@ class Smoothing(Stage):
         try:
             folder = resources.enter_context(TemporaryDirectory(prefix="slam_graph_"))
             resources.enter_context(self._recording)  # released before the folder is removed
-            recording = backend.FinalBa.Log.recording(rig, config, Path(folder))
+            recording = backend.FrameLog.recording(rig, config, Path(folder))
             self._log = self._recording.enter_context(recording)
         except OSError as error:
             self._give_up(error)
@@ -77,7 +77,7 @@ class Smoothing(Stage):
             self._recording.close()
             self._solve(self._log)
 
-    def _solve(self, log: backend.FinalBa.Log) -> None:
+    def _solve(self, log: backend.FrameLog) -> None:
         result = self._result
         calibrated = result.logs.calibration.latest
         segments = result.segments

@@ -82,7 +82,7 @@ class ConfigTree:
 
     @staticmethod
     def value(text: str) -> Any:
-        """The value of a YAML text that nobody vouches for: bounded, and without tags.
+        """The value of an untrusted YAML text: bounded, and without tags.
 
         Raises:
             YamlTextError: if it is not YAML, or nested or repeated beyond all bounds.

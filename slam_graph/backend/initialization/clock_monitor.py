@@ -42,7 +42,7 @@ _FEWEST_AFTER = 15
 """Fewest rotations after the change of which the new offset is taken."""
 _AFTER_NS = 100_000_000
 """The new beginning keeps this far from the time of the change."""
-_GAP_NEAR_NS = 1_000_000_000
+_GAP_NEAR_NS = 2_000_000_000
 """A gap in the samples that is this near to the change, and as long, is where it happened."""
 
 
@@ -190,7 +190,10 @@ def _change(
     before_ns = round(before_s * 1e9)
     gap = _gap(imu.data, first_ns + before_ns, change_s, sigma_s)
     since_ns, shift_s, sigma_s = gap or (first_ns + before_ns, change_s, sigma_s)
-    return ClockChange(since_ns, good_ns + before_ns, first_ns + _AFTER_NS, shift_s, sigma_s)
+    good_ns += before_ns
+    if gap is not None:  # it may be older than all of the rotations
+        good_ns = min(good_ns, since_ns - round(shift_s * 1e9))
+    return ClockChange(since_ns, good_ns, first_ns + _AFTER_NS, shift_s, sigma_s)
 
 
 def _gap(

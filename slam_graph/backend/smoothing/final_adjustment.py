@@ -14,7 +14,6 @@ import time
 from bisect import bisect_left
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TypeAlias
 
 import numpy as np
 
@@ -55,15 +54,8 @@ class _UndeterminedError(EstimationError):
     """There are too few observations to improve on the causal estimate."""
 
 
-class _OfLog:
-    """What is made of a log names its type."""
-
-    __slots__ = ()
-    Log: TypeAlias = FrameLog
-
-
 @dataclass(frozen=True, slots=True, eq=False)
-class FinalBa(_OfLog):
+class FinalBa:
     """The smoothed trajectory of a recording.
 
     Attributes:
@@ -244,7 +236,7 @@ def _smoothed(log: FrameLog, causal: Trajectory, task: SmoothingTask, report: Re
             states = _aligned(found, held, start[anchor], level)[begin:]
         if link is not None and not absolute:
             states = in_gauge_of(link, states, level)
-        aligned = None if solved else adjusted.aligned  # of a recording in one segment
+        aligned = None if solved else adjusted.aligned  # kept where one segment is all
         solved.append(replace(adjusted, states=[], aligned=aligned))
     if not solved:
         raise EstimationError("the causal estimate covers none of the keyframes")

@@ -210,7 +210,7 @@ class FrameLog:
 
     @cached_property
     def _recorded(self) -> RecordedSequence:
-        """All frames as they were recorded: opened once, as its index is that of the whole run."""
+        """All frames as they were recorded: opened once for each part."""
         return open_dataset(self._path, "recording", diagnostics=_Silent())
 
     def _follows(self, frame_ns: int) -> bool:

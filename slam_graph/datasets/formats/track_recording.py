@@ -186,19 +186,23 @@ class TrackRecordingSequence(RecordedSequence):
         self, after_ns: int | None
     ) -> Iterator[tuple[Callable[[int], str], ImuData]]:
         with (self.path / IMU).open("rb") as file:
-            first = 0 if after_ns is None else self._first_block(file, after_ns)
+            first = 0 if after_ns is None else self._first_sample(file, after_ns)
             file.seek(first * IMU_RECORD.itemsize)
             while len(rows := np.fromfile(file, IMU_RECORD, SAMPLES_PER_BLOCK)):
                 data = ImuData(*(np.ascontiguousarray(rows[n]) for n in ("stamp", "gyro", "accel")))
                 yield partial(_where, file.name, first), data
                 first += len(rows)
 
-    def _first_block(self, file: BinaryIO, after_ns: int) -> int:
-        """The first sample of the first block that ends at or after a time."""
+    def _first_sample(self, file: BinaryIO, after_ns: int) -> int:
+        """The first sample of the first block that is needed from a time on.
+
+        A block is not needed if its last stamp and the next one, of which one may be damaged, are
+        before that time.
+        """
         first = 0
-        while first + SAMPLES_PER_BLOCK <= self._samples:
+        while first + SAMPLES_PER_BLOCK < self._samples:
             file.seek((first + SAMPLES_PER_BLOCK - 1) * IMU_RECORD.itemsize)
-            if np.fromfile(file, IMU_RECORD, 1)["stamp"][0] >= after_ns:
+            if np.any(np.fromfile(file, IMU_RECORD, 2)["stamp"] >= after_ns):
                 break
             first += SAMPLES_PER_BLOCK
         return first
