@@ -159,11 +159,11 @@ def pose_from_matrix(matrix: FloatArray, where: str) -> gtsam.Pose3:
     if matrix.shape != (4, 4) or not np.all(np.isfinite(matrix)):
         raise DataError(f"{where}: expected a finite 4x4 matrix, got shape {matrix.shape}")
     R = matrix[:3, :3]
-    with np.errstate(over="ignore", invalid="ignore"):
-        defect = float(np.max(np.abs(R @ R.T - np.eye(3))))
-    if not defect <= ROTATION_TOLERANCE or np.linalg.det(R) < 0:
+    with np.errstate(all="ignore"):  # numbers of a damaged file
+        defect, det = float(np.max(np.abs(R @ R.T - np.eye(3)))), float(np.linalg.det(R))
+    if not defect <= ROTATION_TOLERANCE or det < 0:
         raise DataError(
             f"{where}: the upper left 3x3 block is not a rotation "
-            f"(|R Rᵀ - I| = {defect:.2g}, det = {np.linalg.det(R):.3g})"
+            f"(|R Rᵀ - I| = {defect:.2g}, det = {det:.3g})"
         )
     return gtsam.Pose3(gtsam.Rot3.ClosestTo(R), matrix[:3, 3])

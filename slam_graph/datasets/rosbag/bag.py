@@ -170,7 +170,8 @@ class Bag:
         try:
             yield reader
         finally:
-            reader.close()
+            with self.translated():  # it may be as damaged as the file says
+                reader.close()
 
     @contextmanager
     def translated(self) -> Iterator[None]:

@@ -292,7 +292,7 @@ def require_size(images: Iterable[Image | Fault], camera: Camera, name: str) -> 
     if len(sizes) != 1:
         return
     (size,) = sizes
-    scales = {have / want for have, want in zip(size, calibrated, strict=True)}
+    scales = {have / max(want, 1) for have, want in zip(size, calibrated, strict=True)}
     hint = f" ({scales.pop():g} times as large)" if len(scales) == 1 else ""
     raise DataError(
         f"{name}: images are {size[0]}x{size[1]}{hint}, the calibration is for "
