@@ -42,8 +42,9 @@ _FEWEST_AFTER = 15
 """Fewest rotations after the change of which the new offset is taken."""
 _AFTER_NS = 100_000_000
 """The new beginning keeps this far from the time of the change."""
-_GAP_NEAR_NS = 2_000_000_000
-"""A gap in the samples that is this near to the change, and as long, is where it happened."""
+_GAP_LATER_NS = 2_000_000_000
+"""A gap in the samples that is as long as the change is where it happened: at most this much later
+than the rotations say, and any time before, as without rotation a change does not show."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -203,7 +204,7 @@ def _gap(
 
     Args:
         imu: samples.
-        near_ns: about when the clock has changed.
+        near_ns: when the clock has changed by the rotations, on the clock of the IMU.
         change_s: by how much.
         sigma_s: standard deviation of that.
 
@@ -211,15 +212,14 @@ def _gap(
         Stamp of the first sample after the gap, how much longer than usual it is, and how much
         intervals differ (s); None if there is no such gap.
     """
-    stamps = imu.stamps_ns
-    around = stamps[(stamps > near_ns - _GAP_NEAR_NS) & (stamps < near_ns + _GAP_NEAR_NS)]
-    if len(around) < 2:
+    stamps = imu.stamps_ns[imu.stamps_ns < near_ns + _GAP_LATER_NS]
+    if len(stamps) < 2:
         return None
-    intervals_s = np.diff(around) * 1e-9
+    intervals_s = np.diff(stamps) * 1e-9
     usual_s = float(np.median(intervals_s))
-    largest = int(np.argmax(intervals_s))
-    longer_s = float(intervals_s[largest]) - usual_s
+    nearest = int(np.argmin(np.abs(intervals_s - usual_s - change_s)))
+    longer_s = float(intervals_s[nearest]) - usual_s
     if longer_s < usual_s or abs(longer_s - change_s) > _AGREES_SIGMAS * sigma_s:
         return None
     jitter_s = float(np.median(np.abs(intervals_s - usual_s)))
-    return int(around[largest + 1]), longer_s, jitter_s
+    return int(stamps[nearest + 1]), longer_s, jitter_s

@@ -159,11 +159,17 @@ def pose_from_matrix(matrix: FloatArray, where: str) -> gtsam.Pose3:
     if matrix.shape != (4, 4) or not np.all(np.isfinite(matrix)):
         raise DataError(f"{where}: expected a finite 4x4 matrix, got shape {matrix.shape}")
     R = matrix[:3, :3]
-    with np.errstate(all="ignore"):  # numbers of a damaged file
-        defect, det = float(np.max(np.abs(R @ R.T - np.eye(3)))), float(np.linalg.det(R))
-    if not defect <= ROTATION_TOLERANCE or det < 0:
+    defects, dets = rotation_defects(R[None])
+    if not defects[0] <= ROTATION_TOLERANCE or dets[0] < 0:
         raise DataError(
             f"{where}: the upper left 3x3 block is not a rotation "
-            f"(|R Rᵀ - I| = {defect:.2g}, det = {det:.3g})"
+            f"(|R Rᵀ - I| = {defects[0]:.2g}, det = {dets[0]:.3g})"
         )
     return gtsam.Pose3(gtsam.Rot3.ClosestTo(R), matrix[:3, 3])
+
+
+def rotation_defects(R: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Largest element (N,) of |R Rᵀ - I|, and determinant (N,), of matrices (N, 3, 3) of a file."""
+    with np.errstate(all="ignore"):  # the numbers may be damaged
+        defects = np.abs(R @ R.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
+        return np.asarray(defects), np.asarray(np.linalg.det(R))

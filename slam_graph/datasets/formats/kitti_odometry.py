@@ -18,7 +18,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from slam_graph.arrays import BoolArray, FloatArray
-from slam_graph.datasets.calibration.calibration_yaml import ROTATION_TOLERANCE
+from slam_graph.datasets.calibration.calibration_yaml import ROTATION_TOLERANCE, rotation_defects
 from slam_graph.datasets.calibration.kalibr_calibration import read_kalibr
 from slam_graph.datasets.formats.kitti_files import (
     increasing,
@@ -118,12 +118,9 @@ def _read_poses(path: Path) -> FloatArray:
 
 def _are_poses(matrices: FloatArray) -> BoolArray:
     """Which matrices (N, 3, 4) are finite, with a rotation in their first three columns."""
-    R = matrices[:, :, :3]
-    with np.errstate(over="ignore", invalid="ignore"):
-        defects = np.abs(R @ R.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
-        proper = np.linalg.det(R) > 0.0
+    defects, dets = rotation_defects(matrices[:, :, :3])
     finite = np.isfinite(matrices).all(axis=(1, 2))
-    return np.asarray(finite & proper & (defects <= ROTATION_TOLERANCE), bool)
+    return np.asarray(finite & (dets > 0.0) & (defects <= ROTATION_TOLERANCE), bool)
 
 
 def _read_rig(path: Path, streams: list[FileImages]) -> Rig:
