@@ -9,7 +9,7 @@ import pytest
 
 import slam_graph as sg
 from slam_graph.backend import BackendConfig
-from slam_graph.backend.initialization.clock_monitor import ClockChange
+from slam_graph.backend.initialization.clock_change import ClockChange
 from slam_graph.backend.initialization.start_calibration import FoundCalibration, StartCalibration
 from slam_graph.datasets.faults.injection import inject
 from slam_graph.datasets.sequence import RecordedSequence

@@ -30,7 +30,7 @@ from slam_graph.backend.engine import SquareRootEngine
 from slam_graph.backend.engine_protocol import Engine, EngineContext, StepReport
 from slam_graph.backend.estimator_knowledge import EstimatorKnowledge
 from slam_graph.backend.gtsam_smoothers.smoother_engine import SmootherEngine
-from slam_graph.backend.initialization import clock_monitor
+from slam_graph.backend.initialization import clock_change
 from slam_graph.backend.initialization.first_state import start_from
 from slam_graph.backend.initialization.start_calibration import FoundCalibration, StartCalibration
 from slam_graph.backend.initialization.start_up import StartUp
@@ -67,10 +67,10 @@ class Estimator(EstimatorKnowledge):
         report: what is known of the last step besides the state.
         aiding: takes position fixes and odometry up to the next frame.
         clock_change: found at the last frame: the state is wrong since then; see `begin_segment`.
-        clock_changes: all that are corrected in the IMU samples, in their order.
+        clock_changes: those that are corrected in the IMU samples.
     """
 
-    ClockChange: TypeAlias = clock_monitor.ClockChange
+    ClockChanges: TypeAlias = clock_change.ClockChanges
 
     def __init__(
         self,
@@ -92,8 +92,8 @@ class Estimator(EstimatorKnowledge):
         """
         config, diagnostics = config or BackendConfig(), diagnostics or Diagnostics()
         self._real_rig = rig
-        self.clock_change: clock_monitor.ClockChange | None = None
-        self.clock_changes: list[clock_monitor.ClockChange] = []
+        self.clock_change: clock_change.ClockChange | None = None
+        self.clock_changes = clock_change.ClockChanges()
         dynamics = self._dynamics = Dynamics.of(with_depth_camera(rig), algorithm, config)
         rig, algorithm, config = dynamics.rig, dynamics.algorithm, dynamics.config
         self._make_engine: Callable[[EngineContext], Engine] = SquareRootEngine
@@ -155,6 +155,11 @@ class Estimator(EstimatorKnowledge):
         self._engine = self._make_engine(self._context)  # nothing is left of an earlier start
         self.aiding.restart()
 
+    def find_clock_change(self) -> clock_change.ClockChange | None:
+        """The change of the clock that explains why an estimate is lost, if there is one."""
+        self.clock_change = self.clock_change or self._check.clock_change(self._context.imu)
+        return self.clock_change
+
     def begin_segment(self, before: NavState | None, measured: bool = True) -> None:
         """Forget the state, which is lost, and start again with the frames that follow.
 
@@ -173,7 +178,7 @@ class Estimator(EstimatorKnowledge):
         self._check.forget()
         if change is not None:
             frames = [*change.after(recent), *held]
-            self.clock_changes.append(change)
+            self.clock_changes = self.clock_changes.and_then(change)
             imu.data = change.corrected(imu.data)
         if change is not None or self._held is not None:
             self._held = deque(frames)
@@ -187,9 +192,7 @@ class Estimator(EstimatorKnowledge):
         """Add IMU samples that follow those already given; others are counted and left out."""
         if not self.rig.has_imu:  # they mean nothing
             return
-        for change in self.clock_changes:
-            imu = change.corrected(imu)
-        left_out = self._context.imu.add(imu)
+        left_out = self._context.imu.add(self.clock_changes.corrected(imu))
         if left_out:
             message = f"{left_out} IMU samples are not finite or not in order"
             self.diagnostics.warn("imu_rejected", message)

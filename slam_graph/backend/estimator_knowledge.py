@@ -14,7 +14,7 @@ from slam_graph.backend.aiding.aiding_factors import Aiding
 from slam_graph.backend.backend_config import BackendConfig
 from slam_graph.backend.cost.track_fit import TrackFit
 from slam_graph.backend.engine_protocol import Engine, EngineContext
-from slam_graph.backend.initialization.clock_monitor import ClockChange
+from slam_graph.backend.initialization.clock_change import ClockChanges
 from slam_graph.backend.initialization.segment_joint import SegmentJoint
 from slam_graph.backend.initialization.start_up import StartUp
 from slam_graph.backend.solve.state import FrameMotion
@@ -31,13 +31,13 @@ class EstimatorKnowledge:
         window: the variables and what is known of them; None as long as there is no state.
         aiding: takes position fixes and odometry up to the next frame.
         rig: the sensors, as calibrated or corrected at the start.
-        clock_changes: all that are corrected in the IMU samples, in their order.
+        clock_changes: those that are corrected in the IMU samples.
     """
 
     window: Window | None
     aiding: Aiding
     rig: Rig
-    clock_changes: list[ClockChange]
+    clock_changes: ClockChanges
     _real_rig: Rig
     _corrected: bool
     _engine: Engine
@@ -142,12 +142,11 @@ class EstimatorKnowledge:
         return self.rig.select(len(self._real_rig.cameras)) if self._corrected else None
 
     @property
-    def recorded_rig(self) -> Rig | None:
-        """The corrected rig on the clock of the IMU samples as they come; None if nothing is."""
+    def rig_on_raw_clock(self) -> Rig | None:
+        """The corrected rig against the IMU samples as they come; None if nothing is corrected."""
         if not self.clock_changes:
             return self.corrected_rig
-        shift_s = sum(change.shift_s for change in self.clock_changes)
-        return self.rig.select(len(self._real_rig.cameras)).shifted(shift_s)
+        return self.rig.select(len(self._real_rig.cameras)).shifted(self.clock_changes.shift_s)
 
     @property
     def fix_calibration(self) -> AidingData.Calibration | None:

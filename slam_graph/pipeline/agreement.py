@@ -56,18 +56,6 @@ class JumpError(DivergenceError):
     """The platform is somewhere else, and the IMU has not measured how it came there."""
 
 
-class ClockError(DivergenceError):
-    """The clock of the IMU has changed, so that the estimate is wrong since then.
-
-    Attributes:
-        good_ns: time until which states are not affected.
-    """
-
-    def __init__(self, change: Estimator.ClockChange) -> None:
-        super().__init__(change.message)
-        self.good_ns = change.good_ns
-
-
 def check_sane(state: NavState, config: RunConfig) -> None:
     """Refuse a state that cannot be true.
 

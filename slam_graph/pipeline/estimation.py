@@ -15,7 +15,7 @@ from slam_graph.backend import Estimator
 from slam_graph.datasets import Sequence
 from slam_graph.errors import DataError
 from slam_graph.geometry import NavState, Trajectory, interpolate
-from slam_graph.pipeline.agreement import ClockError, DivergenceError, check_sane
+from slam_graph.pipeline.agreement import DivergenceError, check_sane
 from slam_graph.pipeline.recovery import Recovery
 from slam_graph.pipeline.stage import EstimatedFrame
 from slam_graph.pipeline.tracking import TrackedPacket
@@ -146,6 +146,8 @@ class Estimation:
             self._recovery.begin_segment(error, tracked.features.stamp_ns)
             self._start = KnownStart()
             self._result.start_was_given &= len(self._result.segments) > 0
+            if estimator.replayed is not None:
+                self._note_calibration()
             state, lost = None, True
         tracked.clock.lap("backend", {k: 1e3 * s for k, s in estimator.report.timings.items()})
         ids, points = estimator.landmarks()
@@ -168,8 +170,8 @@ class Estimation:
             estimator.aiding.offset_s,
             self._result.fix_calibration,
             imu_noise_at_limit=estimator.imu_noise_at_limit,
-            recorded_rig=estimator.recorded_rig,
-            clock_changes=tuple(estimator.clock_changes),
+            rig_on_raw_clock=estimator.rig_on_raw_clock,
+            clock_changes=estimator.clock_changes,
         )
         self._note(frame, tracked)
         return frame
@@ -182,6 +184,11 @@ class Estimation:
         else:
             self._recovery.supersede(states)
         self._note_fixes()
+
+    def _note_calibration(self) -> None:
+        """Note under which calibration, and in which world, the estimate has begun anew."""
+        self._result.corrected_rig = self.estimator.corrected_rig
+        self._result.georeferenced = self.estimator.aiding.aligned
 
     def _note_fixes(self) -> None:
         """Note lever arm and clock of the position fixes as they are known now."""
@@ -219,12 +226,11 @@ class Estimation:
             ) from error
         if estimator.replayed is not None:  # what was said of these frames so far is superseded
             self._recovery.supersede(estimator.replayed)
-            result.corrected_rig = estimator.corrected_rig
-            result.georeferenced = estimator.aiding.aligned
+            self._note_calibration()
             if len(result.segments) < 2:
                 result.start_was_given &= estimator.start_is_given
         if estimator.clock_change is not None and result.config.limits.recovery:
-            raise ClockError(estimator.clock_change)
+            raise DivergenceError(estimator.clock_change.message)
         self._note_fixes()
         if state is not None:
             check_sane(state, result.config)

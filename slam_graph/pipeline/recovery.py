@@ -16,13 +16,7 @@ import numpy as np
 from slam_graph.backend import Estimator
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.geometry import NavState
-from slam_graph.pipeline.agreement import (
-    Agreement,
-    ClockError,
-    DivergenceError,
-    JumpError,
-    check_sane,
-)
+from slam_graph.pipeline.agreement import Agreement, DivergenceError, JumpError, check_sane
 from slam_graph.results import RunResult
 from slam_graph.sensors import ImuData
 
@@ -112,8 +106,11 @@ class Recovery:
         Raises:
             DivergenceError: the same, if a new start has no prospect or is not wanted.
         """
-        result = self._result
-        good_ns = self._good_until(lost)
+        result, measured = self._result, not isinstance(lost, JumpError)
+        change = self._estimator.find_clock_change() if measured else None
+        if change is not None:
+            lost = DivergenceError(change.message)
+        good_ns = self._good_until(None if change is None else change.good_ns)
         if good_ns is not None:
             result.segments.losses.append((good_ns, noticed_ns))
         if not result.config.limits.recovery:
@@ -127,7 +124,6 @@ class Recovery:
         if self._short >= _MOST_SHORT:
             raise lost
         self._agreement = Agreement(result.config)
-        measured = not isinstance(lost, JumpError)
         self._diagnostics.warn("new_segment", f"{lost}; the run starts again from here")
         try:
             self._estimator.begin_segment(before, measured)
@@ -138,11 +134,15 @@ class Recovery:
             self._estimator.begin_segment(before, measured)
         self.append(self._estimator.states)
 
-    def _good_until(self, lost: DivergenceError) -> int | None:
-        """Until when the states of the present segment are good; None if none is."""
+    def _good_until(self, unchanged_ns: int | None) -> int | None:
+        """Until when the states of the present segment are good; None if none is.
+
+        Args:
+            unchanged_ns: until when the clock was as before, if it has changed.
+        """
         segments, agreed_ns = self._result.segments, self._agreement.agreed_until()
-        if isinstance(lost, ClockError):
-            agreed_ns = lost.good_ns
+        if unchanged_ns is not None:
+            agreed_ns = unchanged_ns if agreed_ns is None else min(agreed_ns, unchanged_ns)
         if not segments.goes_on or agreed_ns is None:
             return None
         good_ns = agreed_ns - _MARGIN_NS

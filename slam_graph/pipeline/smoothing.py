@@ -61,7 +61,8 @@ class Smoothing(Stage):
             packet = frame.packet
             aiding = packet.aiding if self._log.rig.has_scale else None
             self._log.add(packet.imu, frame.features, frame.imu_noise, aiding)
-            self._log.clock_changes = frame.clock_changes
+            if frame.clock_changes is not None:
+                self._log.clock_changes = frame.clock_changes
             self._log.georeferenced = frame.georeferenced
             self._log.fix_offset_s = frame.fix_offset_s
             self._log.fix_calibration = frame.fix_calibration

@@ -60,7 +60,7 @@ class EstimatedFrame:
         fix_calibration: lever arm and clock of the fixes, where they are estimated with the states.
         objects: what moves; None where moving objects are not estimated.
         imu_noise_at_limit: whether a noise density of the IMU was raised as far as it may be.
-        recorded_rig: the same calibration on the clock that the IMU samples of packets have now.
+        rig_on_raw_clock: the calibration against the IMU samples of packets as they come now.
         clock_changes: of that clock so far; states are on the clock of the beginning.
     """
 
@@ -82,8 +82,8 @@ class EstimatedFrame:
     fix_calibration: AidingData.Calibration | None = None
     objects: ObjectFrame | None = None
     imu_noise_at_limit: bool = False
-    recorded_rig: Rig | None = None
-    clock_changes: tuple[Estimator.ClockChange, ...] = ()
+    rig_on_raw_clock: Rig | None = None
+    clock_changes: Estimator.ClockChanges | None = None
 
     @property
     def image(self) -> np.ndarray | None:
@@ -95,14 +95,12 @@ class EstimatedFrame:
     def imu(self) -> ImuData:
         """The IMU samples since the frame before, on the clock of the beginning."""
         samples = self.packet.imu
-        for change in self.clock_changes:
-            samples = change.corrected(samples)
-        return samples
+        return samples if self.clock_changes is None else self.clock_changes.corrected(samples)
 
     def feedback(self) -> Feedback:
         """What the front end is told about the features."""
         return Feedback.of(
-            self.state, self.rejected, self.landmark_ids, self.landmarks, self.recorded_rig
+            self.state, self.rejected, self.landmark_ids, self.landmarks, self.rig_on_raw_clock
         )
 
 

@@ -11,86 +11,38 @@ ratio: Page 1954).
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass
-
 import numpy as np
 
 from slam_graph.arrays import FloatArray
+from slam_graph.backend.initialization.clock_change import ClockChange
 from slam_graph.backend.initialization.gyro_alignment import (
+    MIN_TURNS,
     GyroAlignment,
     Turns,
     align_gyroscope,
     log_likelihood_ratios,
     offset_step,
 )
-from slam_graph.sensors import FeatureFrame, ImuBuffer, ImuData, RigCamera
+from slam_graph.sensors import ImuBuffer, ImuData, RigCamera
 
 _FIRST_SIGMA_S, _KNOWN_SIGMA_S = 5e-3, 3e-3
 """An offset is taken from rotations that show it to this; it is found anew until it is known to
 that."""
-_AGREES_SIGMAS = 3.0
-"""Two offsets are the same if they differ by fewer standard deviations."""
-_DIFFERS_SIGMAS = 4.0
-"""A Gauss-Newton step that is larger is followed by a search over all offsets."""
+_DIFFERS_SIGMAS, _AGREES_SIGMAS, _APART_SIGMAS = 4.0, 3.0, 5.0
+"""A Gauss-Newton step on few rotations that is larger than the first is followed by an estimate
+from all. It agrees with the estimates before if they are within the second of one another, in
+standard deviations of both, and is of another clock only beyond the third."""
 _CHANGED_SIGMAS, _CHANGED_S, _CHANGED_SIGMA_S = 8.0, 8e-3, 4e-3
-"""The clock has changed if the offset differs by so many standard deviations, by so much, and is
-known to this. Good recordings show up to 3.2 standard deviations."""
-_APART_SIGMAS = 5.0
-"""It must also differ by so many of both estimates, before and now."""
-_FEWEST_AFTER = 15
-"""Fewest rotations after the change of which the new offset is taken."""
+"""For a change it must also differ from the offset that holds (that of the calibration, where the
+estimates agree with it) by so many of its standard deviations, by so much, and be known to this.
+Good recordings show up to 3.2 standard deviations."""
+_LATE_NS = 2_500_000_000
+"""If all rotations show no change, those of this last time may: all are of the new clock then."""
 _AFTER_NS = 100_000_000
 """The new beginning keeps this far from the time of the change."""
 _GAP_LATER_NS = 2_000_000_000
 """A gap in the samples that is as long as the change is where it happened: at most this much later
 than the rotations say, and any time before, as without rotation a change does not show."""
-
-
-@dataclass(frozen=True, slots=True)
-class ClockChange:
-    """A change of the clock of the IMU against that of the cameras.
-
-    Attributes:
-        since_ns: stamp of the first IMU sample on the new clock, with earlier changes corrected.
-        good_ns: time on the clock of the IMU until which states are not affected.
-        frames_ns: time on the clock of the cameras from which frames are of the new clock.
-        shift_s: how much later the new clock is, s.
-        sigma_s: standard deviation of that.
-    """
-
-    since_ns: int
-    good_ns: int
-    frames_ns: int
-    shift_s: float
-    sigma_s: float
-
-    @property
-    def message(self) -> str:
-        """What has happened."""
-        later = "later" if self.shift_s > 0.0 else "earlier"
-        return (
-            f"the clock of the IMU is {1e3 * abs(self.shift_s):.1f} ± {1e3 * self.sigma_s:.1f} ms "
-            f"{later} against the cameras since {self.since_ns} ns"
-        )
-
-    def corrected(self, imu: ImuData) -> ImuData:
-        """Samples on the old clock; those that would not be later than the one before are left out.
-
-        Args:
-            imu: samples as they were recorded, or corrected by the changes before this one.
-        """
-        new = imu.stamps_ns >= self.since_ns
-        if not new.any():
-            return imu
-        stamps = imu.stamps_ns - new * round(self.shift_s * 1e9)
-        latest = np.maximum.accumulate(np.append(np.iinfo(np.int64).min, stamps))[:-1]
-        kept = stamps > latest
-        return ImuData(stamps[kept], imu.gyro[kept], imu.accel[kept])
-
-    def after(self, frames: Iterable[FeatureFrame]) -> list[FeatureFrame]:
-        """Those of some frames that were taken since."""
-        return [frame for frame in frames if frame.stamp_ns >= self.frames_ns]
 
 
 class ClockMonitor:
@@ -102,14 +54,28 @@ class ClockMonitor:
             only the calibration says it.
 
     Attributes:
-        agrees: whether the last estimate agrees with those before.
+        contradicted: whether the last estimate contradicts those before, but not beyond doubt.
     """
 
     def __init__(self, camera: RigCamera, known: tuple[float, float] | None = None) -> None:
         self._R = camera.body_T_camera.rotation().matrix()
         self._nominal_s = camera.clock_offset_s
         self._known = known
-        self.agrees = False
+        self.contradicted = False
+
+    def confirms_calibration(self, found: GyroAlignment) -> bool:
+        """Whether the calibrated offset was right before, so that another one is a change."""
+        if self._known is None or self._known[1] > _KNOWN_SIGMA_S:
+            return False
+        apart_s = _APART_SIGMAS * float(np.hypot(found.offset_sigma_s, self._known[1]))
+        return self._is_calibrated and abs(found.offset_s - self._known[0]) > apart_s
+
+    @property
+    def _is_calibrated(self) -> bool:
+        """Whether what is known agrees with the calibration."""
+        assert self._known is not None
+        known_s, sigma_s = self._known
+        return abs(known_s - self._nominal_s) < _AGREES_SIGMAS * sigma_s
 
     def needs_estimate(self, turns: Turns, imu: ImuData) -> bool:
         """Whether few rotations show another offset than before, or it is not known well yet.
@@ -131,11 +97,18 @@ class ClockMonitor:
             covered: rotations as close together as at the start, and samples that cover them.
             imu: all recent samples.
         """
-        found = align_gyroscope(*covered, self._R, self._nominal_s)
-        self.agrees = False
-        if found is None or not found.is_clear():
-            return None
-        return self.compare(found, covered, imu)
+        turns, samples = covered
+        late = turns.first_ns >= int(turns.second_ns.max()) - _LATE_NS
+        self.contradicted = False
+        for part in (turns, turns.select(late)):
+            if len(part.first_ns) < MIN_TURNS:
+                break
+            found = align_gyroscope(part, samples, self._R, self._nominal_s)
+            if found is not None and found.is_clear():
+                change = self.compare(found, covered, imu)
+                if change is not None:
+                    return change
+        return None
 
     def compare(
         self, found: GyroAlignment, covered: tuple[Turns, ImuData], imu: ImuBuffer
@@ -154,12 +127,13 @@ class ClockMonitor:
             return None
         known_s, known_sigma_s = self._known
         both_s = float(np.hypot(sigma_s, known_sigma_s))
-        self.agrees = abs(offset_s - known_s) < _AGREES_SIGMAS * both_s
-        if self.agrees and sigma_s < known_sigma_s:
-            self._known = offset_s, sigma_s
-        confirmed = abs(known_s - self._nominal_s) < _AGREES_SIGMAS * known_sigma_s
-        before_s = self._nominal_s if confirmed else known_s
-        limit_s = max(_CHANGED_S, _CHANGED_SIGMAS * (sigma_s if confirmed else both_s))
+        if abs(offset_s - known_s) < _AGREES_SIGMAS * both_s:
+            if sigma_s < known_sigma_s:
+                self._known = offset_s, sigma_s
+            return None
+        self.contradicted = True
+        before_s = self._nominal_s if self._is_calibrated else known_s
+        limit_s = max(_CHANGED_S, _CHANGED_SIGMAS * (sigma_s if self._is_calibrated else both_s))
         if (
             sigma_s > _CHANGED_SIGMA_S
             or abs(offset_s - known_s) < _APART_SIGMAS * both_s
@@ -185,8 +159,9 @@ def _change(
         return None
     good_ns, first_ns = int(turns.first_ns[split]), int(turns.second_ns[split])
     after = turns.first_ns >= first_ns
-    if np.count_nonzero(after) >= _FEWEST_AFTER:
-        found = align_gyroscope(turns.select(after), samples, R, before_s) or found
+    if np.count_nonzero(after) >= MIN_TURNS:
+        later = align_gyroscope(turns.select(after), samples, R, before_s)
+        found = later if later is not None and later.is_clear() else found
     change_s, sigma_s = found.offset_s - before_s, found.offset_sigma_s
     before_ns = round(before_s * 1e9)
     gap = _gap(imu.data, first_ns + before_ns, change_s, sigma_s)

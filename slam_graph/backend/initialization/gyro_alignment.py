@@ -25,6 +25,8 @@ from slam_graph.sensors import ImuData
 
 MAX_OFFSET_S = 0.12
 """Largest time offset that is looked for, of either sign."""
+MIN_TURNS = 15
+"""Fewest rotations for an estimate."""
 CLEAR = 30.0
 """Smallest margin of a minimum: the second best has a probability of exp(-30) of the best."""
 _MAX_MISFIT = 30.0

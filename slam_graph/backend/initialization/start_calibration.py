@@ -17,7 +17,8 @@ import gtsam
 import numpy as np
 
 from slam_graph.backend.backend_config import BackendConfig, CalibrationConfig
-from slam_graph.backend.initialization.clock_monitor import ClockChange, ClockMonitor
+from slam_graph.backend.initialization.clock_change import ClockChange
+from slam_graph.backend.initialization.clock_monitor import ClockMonitor
 from slam_graph.backend.initialization.gyro_alignment import (
     CLEAR,
     GyroAlignment,
@@ -31,9 +32,10 @@ _SPACING_NS, _LATER_SPACING_NS = 45_000_000, 360_000_000
 """Smallest time between two frames that are used, at the start and later."""
 _LATER_TURNS = 10
 """Fewest rotations for a test of the clock later."""
-_RETRY_NS, _LATER_RETRY_NS, _LATER_PAUSE_NS = 400_000_000, 900_000_000, 5_000_000_000
-"""Time between two estimates at the start, between two tests of the clock later, and after one
-that an estimate did not confirm."""
+_RETRY_NS, _LATER_RETRY_NS = 400_000_000, 900_000_000
+"""Time between two estimates at the start, and between two tests of the clock later."""
+_LATER_PAUSE_NS, _LONGEST_PAUSE_NS = 5_000_000_000, 60_000_000_000
+"""Time after an estimate that shows nothing, and after many of them: each takes 0.1 s."""
 _RECENT_NS = 6_000_000_000
 """How long frames are kept to begin anew from."""
 _CLEAR_WAITING = 15.0
@@ -89,7 +91,7 @@ class StartCalibration:
         self.mounted = self._camera.rotation_known
         self.recent: deque[FeatureFrame] = deque()
         self._turns = VisualTurns(self._camera, config.noise.pixel_sigma)
-        self._next_ns = 0
+        self._next_ns, self._pause_ns = 0, _LATER_PAUSE_NS
         self._checks = config.initialization.check_calibration
         self._monitor = ClockMonitor(self._camera) if self.mounted else None
         self.done = not self._checks and self.mounted
@@ -135,7 +137,11 @@ class StartCalibration:
         if found is None or not found.is_clear(CLEAR if started else _CLEAR_WAITING):
             return None
         change = None if monitor is None else monitor.compare(found, covered, imu)
-        return change or self._judged(found, _ADOPTED_SIGMA_S if started else _WAITING_SIGMA_S)
+        if change is not None:
+            return change
+        if self._monitor is not None and self._monitor.confirms_calibration(found):
+            return None  # the clock has changed since, which is said once there is a state
+        return self._judged(found, _ADOPTED_SIGMA_S if started else _WAITING_SIGMA_S)
 
     def _watch(
         self, frame: FeatureFrame, imu: ImuBuffer, monitor: ClockMonitor | None
@@ -146,16 +152,30 @@ class StartCalibration:
             return None
         self._next_ns = frame.stamp_ns + _LATER_RETRY_NS
         covered = self._turns.covered(imu, _LATER_TURNS)
-        if covered is None or not monitor.needs_estimate(*covered):
+        if covered is None:
+            return None
+        if not monitor.needs_estimate(*covered):
+            self._pause_ns = _LATER_PAUSE_NS
+            return None
+        change = self.clock_change(imu)
+        if change is not None or not monitor.contradicted:
+            self._next_ns = frame.stamp_ns + self._pause_ns
+            self._pause_ns = min(2 * self._pause_ns, _LONGEST_PAUSE_NS)
+        return change
+
+    def clock_change(self, imu: ImuBuffer) -> ClockChange | None:
+        """A change of the clock in the last seconds, by all frames that are kept.
+
+        Args:
+            imu: samples so far.
+        """
+        if self._monitor is None or not self._checks:
             return None
         turns = VisualTurns(self._camera, self._config.noise.pixel_sigma)
-        for before in self.recent:
-            turns.add(before, imu, self.mounted, _SPACING_NS)
+        for frame in self.recent:
+            turns.add(frame, imu, self.mounted, _SPACING_NS)
         covered = turns.covered(imu)
-        change = None if covered is None else monitor.estimate(covered, imu)
-        if monitor.agrees:
-            self._next_ns = frame.stamp_ns + _LATER_PAUSE_NS
-        return change
+        return None if covered is None else self._monitor.estimate(covered, imu)
 
     def contradiction(self, imu: ImuBuffer) -> str | None:
         """What of mounting or units the rotations of the last seconds contradict, if anything."""

@@ -11,7 +11,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from slam_graph.arrays import FloatArray
-from slam_graph.backend.initialization.gyro_alignment import MAX_OFFSET_S, Turns
+from slam_graph.backend.initialization.gyro_alignment import MAX_OFFSET_S, MIN_TURNS, Turns
 from slam_graph.backend.initialization.visual_rotation import MIN_COMMON, visual_rotation
 from slam_graph.sensors import FeatureFrame, ImuBuffer, ImuData, RigCamera
 
@@ -23,8 +23,6 @@ _WINDOW_NS = 5_000_000_000
 """Over this time bias and offset are taken to be constant."""
 _SHORTEST_TREND_S = 0.02
 """The motion within a frame is a line fitted to the gyroscope over the readout, or over this."""
-MIN_TURNS = 15
-"""Fewest rotations for an estimate."""
 
 
 class VisualTurns:
@@ -121,7 +119,13 @@ class VisualTurns:
         return np.asarray(Rotation.from_rotvec(vector).as_matrix())
 
     def covered(self, imu: ImuBuffer, fewest: int = MIN_TURNS) -> tuple[Turns, ImuData] | None:
-        """The turns that the gyroscope covers, and its samples; None if they are too few."""
+        """The turns that the gyroscope covers, and its samples; None if they are too few.
+
+        Args:
+            imu: recent samples; they count where they reach 0.13 s beyond both frames, under the
+                calibrated offset.
+            fewest: fewest turns.
+        """
         nominal_ns = round(self._camera.clock_offset_s * 1e9)
         around_ns = round(MAX_OFFSET_S * 1e9) + 10_000_000
         newest_ns = imu.newest_ns() - nominal_ns - around_ns

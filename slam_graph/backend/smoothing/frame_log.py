@@ -22,7 +22,7 @@ import numpy as np
 from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.backend.depth_camera import with_depth_camera, with_depth_observed
 from slam_graph.backend.dynamics import motionless_samples
-from slam_graph.backend.initialization.clock_monitor import ClockChange
+from slam_graph.backend.initialization.clock_change import ClockChanges
 from slam_graph.backend.smoothing.smoothing_config import FinalBaConfig
 from slam_graph.datasets import RecordedSequence, TrackRecorder, open_dataset
 from slam_graph.diagnostics import Diagnostics
@@ -86,7 +86,7 @@ class FrameLog:
         self._last_ids = np.zeros(0, np.int64)
         self._aiding: list[AidingData] = []
         self.observations = 0
-        self.clock_changes: tuple[ClockChange, ...] = ()
+        self.clock_changes = ClockChanges()
         self.georeferenced, self.fix_offset_s = False, 0.0
         self.fix_calibration: AidingData.Calibration | None = None
 
@@ -188,21 +188,19 @@ class FrameLog:
 
     def packets(self, first: int, stop: int, rig: Rig) -> Iterator[Packet]:
         """Frames `first` to `stop - 1`, each with the samples since the one before."""
-        shift_s = sum(change.shift_s for change in self.clock_changes)
-        sequence = self._recorded
-        sequence.rig = replace(rig.shifted(max(0.0, shift_s)), has_imu=True)  # how far samples lead
-        begin_ns = self._frames[first]
-        # samples of a clock that became earlier are of frames before
-        earlier_ns = begin_ns if shift_s >= 0.0 else begin_ns + round(shift_s * 1e9) - _AROUND_NS
+        clocks, sequence, begin_ns = self.clock_changes, self._recorded, self._frames[first]
+        # it says how far samples lead; those of a clock that became earlier are of frames before
+        sequence.rig = replace(rig.shifted(clocks.latest_s), has_imu=True)
+        earlier_ns = begin_ns
+        if clocks.earliest_s < 0.0:
+            earlier_ns += round(clocks.earliest_s * 1e9) - _AROUND_NS
         before: list[ImuData] = []
         newest_ns = np.iinfo(np.int64).min
         for packet in sequence.packets(earlier_ns, self._frames[stop - 1]):
             before.append(packet.imu)
             if packet.frame.stamp_ns < begin_ns:
                 continue
-            imu = ImuData.concatenate(before)
-            for change in self.clock_changes:
-                imu = change.corrected(imu)
+            imu = clocks.corrected(ImuData.concatenate(before))
             imu = imu[int(np.searchsorted(imu.stamps_ns, newest_ns, side="right")) :]
             newest_ns = int(imu.stamps_ns[-1]) if len(imu) else newest_ns
             yield replace(packet, imu=imu)
