@@ -17,11 +17,11 @@ if TYPE_CHECKING:
     from documented_stock import Stock
 
 
-@pytest.fixture(scope="session", autouse=True)
-def kernels() -> None:
-    """All kernels in the cache, so that no command says that it compiles them."""
-    for module in iter_modules(slam_graph.kernels.__path__):
-        import_module(f"slam_graph.kernels.{module.name}")
+def pytest_sessionstart(session: pytest.Session) -> None:
+    """All kernels in the cache: no command says that it compiles them, no two workers do it."""
+    if not hasattr(session.config, "workerinput"):  # before there are workers
+        for module in iter_modules(slam_graph.kernels.__path__):
+            import_module(f"slam_graph.kernels.{module.name}")
 
 
 @pytest.fixture(scope="session")
