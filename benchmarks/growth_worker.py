@@ -4,7 +4,8 @@
 
 python -m benchmarks.growth_worker ALGORITHM DURATION_S [complete]
 
-A complete run has the final bundle adjustment at its end, and writes all its files.
+A complete run is as one from the command line: it saves the estimate so far on the way, has the
+final bundle adjustment at its end, and writes all its files.
 """
 
 from __future__ import annotations
@@ -52,7 +53,7 @@ class Clock(NullViewer, NullProgress):
 
     Attributes:
         flows: time of the reference, for each `FLOW_EVERY` frames.
-        frames: time of each frame: simulation, back end, and the notes that are kept of it.
+        frames: time of each frame: simulation, back end, and what is noted of it and saved.
         memory: resident memory at the times of the reference, MB.
         causal_s: CPU time of the process at the last frame.
         late_flows: time of the reference after each step of the final bundle adjustment.
@@ -98,13 +99,13 @@ def main(algorithm: str, duration_s: str, complete: str = "") -> None:
     )
     sequence = simulate(SIMULATION.model_copy(update={"duration_s": float(duration_s)}))
     clock = Clock()
-    with threadpool_limits(limits=1):
-        result = run(sequence, config, viewer=clock, progress=clock)
+    with threadpool_limits(limits=1), tempfile.TemporaryDirectory() as folder:
+        so_far = folder if complete else None
+        result = run(sequence, config, viewer=clock, progress=clock, so_far=so_far)
         result.check()
         after_s = time.process_time() - clock.causal_s - clock.late_s
         if complete:
-            with tempfile.TemporaryDirectory() as folder:
-                result.save(folder)
+            result.save(folder)
     table = {
         "frame": clock.frames.cpu.tolist(),
         "reference": clock.flows.cpu.tolist(),

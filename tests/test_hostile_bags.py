@@ -15,7 +15,7 @@ from rosbags.rosbag1 import Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from slam_graph.datasets import open_dataset
-from slam_graph.datasets.rosbag import bounded_unpacking
+from slam_graph.datasets.rosbag import bounded_unpacking, ros_sequence
 from slam_graph.datasets.rosbag.bag import Bag
 from slam_graph.datasets.rosbag.messages import IMU
 from slam_graph.errors import DataError, SlamGraphError
@@ -110,6 +110,40 @@ def test_a_type_with_other_fields_is_damage(tmp_path: Path, field: bytes) -> Non
     path = write_bag(tmp_path, "mcap_file", frames=2)
     path.write_bytes(path.read_bytes().replace(field, field[:-1] + b"x"))
     with suppress(SlamGraphError):
+        read_all(path)
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        (b"float64 x", b"byte[8] x"),  # of the same length in definition and message
+        (b"float64[9] k", b"float64[3] k"),
+        (b"uint32 width", b"byte[4] width"),
+    ],
+)
+def test_a_type_with_fields_of_another_kind_is_damage(
+    tmp_path: Path, old: bytes, new: bytes
+) -> None:
+    path = write_bag(tmp_path, "mcap_file", frames=2)
+    content = path.read_bytes()
+    assert old in content
+    path.write_bytes(content.replace(old, new))
+    with pytest.raises(DataError):
+        read_all(path)
+
+
+@pytest.mark.parametrize("mistake", [AttributeError, TypeError, IndexError])
+def test_a_mistake_of_ours_is_not_called_damage(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, mistake: type[Exception]
+) -> None:
+    """What is made of the fields of a message fails with our own error."""
+
+    def broken(*_: object) -> None:
+        raise mistake("a mistake")
+
+    path = write_bag(tmp_path, "mcap_file", frames=2)
+    monkeypatch.setattr(ros_sequence, "image_of", broken)
+    with pytest.raises(mistake, match="a mistake"):
         read_all(path)
 
 

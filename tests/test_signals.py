@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Signals at any moment: a valid result that says how it ended, and no process is left."""
 
+import ctypes
 import os
 import signal
 import subprocess
@@ -121,6 +122,26 @@ def test_snapshots_change_nothing(flight: Path, tmp_path: Path) -> None:
     np.testing.assert_array_equal(kept.points, plain.points)
     kept.save(tmp_path / "kept")
     assert load_result(tmp_path / "kept").status == "ok"
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="of glibc")
+def test_a_snapshot_gives_free_memory_back(flight: Path, tmp_path: Path) -> None:
+    """What was freed between things that stay is kept by the allocator, if nobody asks for it."""
+    if not hasattr(ctypes.CDLL(None), "malloc_trim"):
+        pytest.skip("of glibc")
+    result = run(flight, duration_s=1.0)
+    blocks = [b"x" * 100_000 for _ in range(800)]
+    stays = blocks[::2]
+    del blocks
+    before_mb = resident_mb()
+    result.save_so_far(tmp_path, 1.0)
+    assert resident_mb() < before_mb - 30.0
+    assert len(stays) == 400
+
+
+def resident_mb() -> float:
+    pages = int(Path("/proc/self/statm").read_text().split()[1])
+    return pages * os.sysconf("SC_PAGE_SIZE") / 1e6
 
 
 def test_an_interrupt_in_the_final_adjustment_keeps_the_causal_result(

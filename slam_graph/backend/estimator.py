@@ -209,8 +209,8 @@ class Estimator(EstimatorKnowledge):
         """Take the features of one time and estimate the state then.
 
         In the first motion the time offset of the cameras is compared with the gyroscope. If it
-        contradicts the calibration, the estimator begins anew with the frames of the last seconds;
-        from then on a frame waits until the IMU has reached its time.
+        contradicts the calibration, the estimator begins anew with the frames of the last seconds.
+        From then on, and after a change of the clock, a frame waits until the IMU has reached it.
 
         Returns:
             The causal estimate with its covariance, stamped on the clock of the IMU. None as long

@@ -22,6 +22,7 @@ _STATE_WIDTH = 16
 _ERROR_WIDTH = len(NavState.COMPONENTS)
 _POSE_WIDTH = 6
 _UPPER = np.triu_indices(_POSE_WIDTH)
+_DIAGONAL = np.equal(*_UPPER)
 
 
 class StateHistory:
@@ -109,7 +110,7 @@ class StateHistory:
 
     def sigmas(self) -> FloatArray:
         """(N, 15) standard deviations, in the order of `NavState.COMPONENTS`."""
-        poses = np.diagonal(self.pose_covariances(), axis1=1, axis2=2)
+        poses = self._pose_covariances.rows()[:, _DIAGONAL]
         variances = np.concatenate([poses, self._other_variances.rows()], axis=1)
         return np.asarray(np.sqrt(np.maximum(variances, 0.0)), dtype=np.float64)
 

@@ -137,6 +137,9 @@ class Recovery:
     def _good_until(self, unchanged_ns: int | None) -> int | None:
         """Until when the states of the present segment are good; None if none is.
 
+        Times are on the clock of the IMU, as those of states are. Those of frames, which tests of
+        the gate have, are taken as they are: an offset is small beside the margin.
+
         Args:
             unchanged_ns: until when the clock was as before, if it has changed.
         """

@@ -8,9 +8,9 @@ from array import array
 from bisect import bisect_left
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from operator import attrgetter
-from typing import Any
+from typing import Any, get_type_hints
 
 import numpy as np
 
@@ -73,8 +73,9 @@ class StepLog:
         return self._costs.rows()
 
 
-_COUNTS = tuple(field.name for field in fields(Innovations) if isinstance(field.default, int))
-_SUMS = tuple(field.name for field in fields(Innovations) if field.name not in _COUNTS)
+_KINDS = get_type_hints(Innovations)
+_COUNTS = tuple(name for name, kind in _KINDS.items() if kind is int)
+_SUMS = tuple(name for name in _KINDS if name not in _COUNTS)
 _counts_of, _sums_of = attrgetter(*_COUNTS), attrgetter(*_SUMS)
 
 
@@ -112,7 +113,7 @@ class InnovationLog:
         """(N,) values of each attribute of `Innovations`, by its name."""
         counts, sums = self._counts.rows().astype(np.float64), self._sums.rows()
         columns = dict(zip((*_COUNTS, *_SUMS), (*counts.T, *sums.T), strict=True))
-        return {field.name: columns[field.name] for field in fields(Innovations)}
+        return {name: columns[name] for name in _KINDS}
 
 
 class CalibrationLog:

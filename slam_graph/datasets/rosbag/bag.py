@@ -30,6 +30,11 @@ METADATA = "metadata.yaml"
 _HEADER_BYTES = 12
 """Length of the beginning of a message that ends with its stamp."""
 
+_OF_FIELDS = (AttributeError, TypeError, ValueError, OverflowError)
+"""What taking a field raises if the bag defines it in another way, or not at all."""
+_OF_DEFINITIONS = (KeyError, ValueError, RecursionError)
+"""What looking through the definition of a type raises, if that cannot be used."""
+
 REINDEX = (
     "if its recording was cut short, rebuild its index first (rosbag reindex, ros2 bag reindex)"
 )
@@ -52,7 +57,7 @@ class Message:
         topic: where it was published.
         received_ns: time at which it was recorded.
         raw: its bytes.
-        parse: turns the bytes into a message object; `decode` calls it.
+        parse: turns the bytes into a message object, or raises a DataError; `decode` calls it.
         bag: where it is from.
     """
 
@@ -65,12 +70,24 @@ class Message:
     def decode(self, take: Callable[[Any], _Taken]) -> _Taken:
         """What a function takes from the message object; also after the bag is closed.
 
+        Args:
+            take: gives fields of the message as numbers, texts and arrays, and does nothing else:
+                here its errors count as damage, in what follows they are our own.
+
         Raises:
             DataError: if the message is damaged, or its fields are not those of its type: a bag
                 carries the definitions of its types itself.
         """
-        with self.bag.translated():
-            return take(self.parse())
+        found = self.parse()
+        with self.bag.translated(_OF_FIELDS):
+            return take(found)
+
+    def decode_or(self, take: Callable[[Any], _Taken], otherwise: _Taken) -> _Taken:
+        """As `decode`, but something else where the message is damaged."""
+        try:
+            return self.decode(take)
+        except DataError:
+            return otherwise
 
 
 class Bag:
@@ -148,10 +165,12 @@ class Bag:
 
     def _parse(self, raw: bytes, msgtype: str) -> Any:
         if msgtype not in self._checked:
-            _check_arrays(self._types, msgtype)
+            with self.translated(_OF_DEFINITIONS):
+                _check_arrays(self._types, msgtype)
             self._checked.add(msgtype)
         deserialize = self._types.deserialize_cdr if self._is_ros2 else self._types.deserialize_ros1
-        return deserialize(raw, msgtype)
+        with self.translated():
+            return deserialize(raw, msgtype)
 
     @contextmanager
     def _open(self) -> Iterator[Reader1 | Reader2]:
@@ -174,13 +193,18 @@ class Bag:
                 reader.close()
 
     @contextmanager
-    def translated(self) -> Iterator[None]:
-        """Turn any exception of the reader of a damaged bag into one line."""
+    def translated(self, errors: tuple[type[Exception], ...] = (Exception,)) -> Iterator[None]:
+        """Turn exceptions that a damaged bag causes into one line.
+
+        Args:
+            errors: which; any of the package's, whose parsers raise anything from struct.error to
+                KeyError.
+        """
         try:
             yield
         except DataError:
             raise
-        except Exception as error:  # its parsers raise anything from struct.error to KeyError
+        except errors as error:
             what = " ".join(str(error).split()) or type(error).__name__
             raise DataError(
                 f"{self.path}: this bag cannot be read ({what[:150]}); {REINDEX}"

@@ -1,6 +1,10 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""ROS messages as measurements: grey images of all common encodings, IMU samples, poses."""
+"""ROS messages as measurements: grey images of all common encodings, IMU samples, poses.
+
+Functions that get a message object only take its fields, as numbers, texts and arrays (see
+`Message.decode`); what is made of them comes after.
+"""
 
 from __future__ import annotations
 
@@ -8,6 +12,7 @@ from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from slam_graph.arrays import FloatArray
 from slam_graph.datasets.streams.images import Fault, Image, decode_grey
@@ -16,12 +21,13 @@ IMU = "sensor_msgs/msg/Imu"
 IMAGE = "sensor_msgs/msg/Image"
 COMPRESSED_IMAGE = "sensor_msgs/msg/CompressedImage"
 CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
+TRANSFORM = "geometry_msgs/msg/TransformStamped"
 TRANSFORMS = "tf2_msgs/msg/TFMessage"
 
 POSES = {
     "geometry_msgs/msg/PoseStamped": "pose",
     "geometry_msgs/msg/PoseWithCovarianceStamped": "pose.pose",
-    "geometry_msgs/msg/TransformStamped": "transform",
+    TRANSFORM: "transform",
     "nav_msgs/msg/Odometry": "pose.pose",
 }
 """The field with the pose in each type of message that has one."""
@@ -61,32 +67,89 @@ _ENCODINGS = {
 """The encodings that can be read; of 16 bits the upper 8 are kept."""
 
 
-def image_of(message: Any, where: str) -> Image | Fault:
-    """The grey image in an `Image` or a `CompressedImage`, or what is wrong with it.
+class RawImage(NamedTuple):
+    """The fields of an `Image`.
+
+    Attributes:
+        encoding: of its pixels.
+        width, height: in pixels.
+        step: bytes of a row, which may end with some that mean nothing.
+        is_bigendian: the order of the bytes of a number.
+        data: (step * height,) bytes, if the message is a good one.
+    """
+
+    encoding: str
+    width: int
+    height: int
+    step: int
+    is_bigendian: bool
+    data: NDArray[np.uint8]
+
+    def rows(self, bits: int, where: str) -> NDArray[np.uint8] | Fault:
+        """(height, N) bytes of the pixels in each row, or what is wrong with them.
+
+        Args:
+            bits: of a pixel.
+            where: it comes from, for the fault.
+        """
+        row, data = self.width * bits // 8, self.data
+        fits = self.step >= row and len(data) == self.step * self.height
+        if self.width < 1 or self.height < 1 or not fits:
+            size = f"{self.width}x{self.height} {self.encoding}, rows of {self.step} bytes"
+            return Fault("image_unreadable", f"{where}: {len(data)} bytes do not make {size}")
+        return data.reshape(self.height, self.step)[:, :row]
+
+
+class PackedImage(NamedTuple):
+    """The fields of a `CompressedImage`.
+
+    Attributes:
+        format: of the file, and of its pixels.
+        data: the file.
+    """
+
+    format: str
+    data: bytes
+
+
+def image_fields(message: Any) -> RawImage | PackedImage:
+    """The fields of an `Image` or a `CompressedImage`."""
+    data = np.asarray(message.data, np.uint8).ravel()
+    if not hasattr(message, "encoding"):
+        return PackedImage(str(message.format), data.tobytes())
+    return RawImage(
+        str(message.encoding),
+        int(message.width),
+        int(message.height),
+        int(message.step),
+        bool(message.is_bigendian),
+        data,
+    )
+
+
+def image_of(image: RawImage | PackedImage, where: str) -> Image | Fault:
+    """The grey image, or what is wrong with it.
 
     Args:
-        message: the message.
+        image: the fields of a message.
         where: it comes from, for the fault.
     """
-    if not hasattr(message, "encoding"):
-        return decode_grey(bytes(message.data), where)
-    encoding = _ENCODINGS.get(message.encoding)
+    if isinstance(image, PackedImage):
+        return decode_grey(image.data, where)
+    encoding = _ENCODINGS.get(image.encoding)
     if encoding is None:
         known = ", ".join(_ENCODINGS)
-        what = f"{where}: unknown encoding '{message.encoding}'; known: {known}"
+        what = f"{where}: unknown encoding '{image.encoding}'; known: {known}"
         return Fault("image_unreadable", what)
-    row = message.width * encoding.channels * encoding.bits // 8
-    data = np.asarray(message.data, np.uint8)
-    if message.step < row or len(data) != message.step * message.height or len(data) == 0:
-        size = f"{message.width}x{message.height} {message.encoding}, rows of {message.step} bytes"
-        return Fault("image_unreadable", f"{where}: {len(data)} bytes do not make {size}")
-    pixels = data.reshape(message.height, message.step)[:, :row]
+    pixels = image.rows(encoding.channels * encoding.bits, where)
+    if isinstance(pixels, Fault):
+        return pixels
     if encoding.bits == 16:
-        upper = 0 if message.is_bigendian else 1
+        upper = 0 if image.is_bigendian else 1
         return np.ascontiguousarray(pixels[:, upper::2])
     if encoding.to_grey is None:
         return np.ascontiguousarray(pixels)
-    shape = (message.height, message.width, encoding.channels)
+    shape = (image.height, image.width, encoding.channels)
     coloured = np.ascontiguousarray(pixels).reshape(shape if encoding.channels > 1 else shape[:2])
     return np.asarray(cv2.cvtColor(coloured, encoding.to_grey), np.uint8)
 
@@ -94,19 +157,27 @@ def image_of(message: Any, where: str) -> Image | Fault:
 def inertial_of(message: Any) -> list[float]:
     """Angular rate [rad/s] and specific force [m/s²] of an `Imu`: six numbers."""
     rate, force = message.angular_velocity, message.linear_acceleration
-    return [rate.x, rate.y, rate.z, force.x, force.y, force.z]
+    return [float(part) for part in (rate.x, rate.y, rate.z, force.x, force.y, force.z)]
 
 
-def pose_sigmas_of(message: Any) -> FloatArray:
-    """(6,) standard deviations of a pose, m along and rad about the axes of its frame.
-
-    NaN where none was set: in messages of types without a covariance, and in three numbers (of the
-    position, or of the orientation) one of which is not positive.
-    """
+def covariance_of(message: Any) -> FloatArray:
+    """(6, 6) the covariance of a pose; NaN in messages of types without one."""
     matrix = getattr(getattr(message, "pose", None), "covariance", None)
     if matrix is None:
-        return np.full(6, np.nan)
-    variances = np.asarray(matrix, np.float64).reshape(6, 6).diagonal().reshape(2, 3)
+        return np.full((6, 6), np.nan)
+    return np.asarray(matrix, np.float64).reshape(6, 6)
+
+
+def sigmas_of(covariance: FloatArray) -> FloatArray:
+    """(6,) standard deviations of a pose, m along and rad about the axes of its frame.
+
+    NaN in three numbers (of the position, or of the orientation) one of which is not positive:
+    those were not set.
+
+    Args:
+        covariance: (6, 6) of a message.
+    """
+    variances = covariance.diagonal().reshape(2, 3)
     known = (variances > 0.0).all(axis=1, keepdims=True)
     return np.sqrt(np.where(known, variances, np.nan)).ravel()
 
@@ -117,6 +188,6 @@ def pose_of(message: Any, msgtype: str) -> list[float]:
     for name in POSES[msgtype].split("."):
         value = getattr(value, name)
     is_transform = hasattr(value, "translation")
-    position = value.translation if is_transform else value.position
+    place = value.translation if is_transform else value.position
     turn = value.rotation if is_transform else value.orientation
-    return [position.x, position.y, position.z, turn.x, turn.y, turn.z, turn.w]
+    return [float(x) for x in (place.x, place.y, place.z, turn.x, turn.y, turn.z, turn.w)]

@@ -7,7 +7,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping
 from functools import partial
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, NamedTuple
 
 import gtsam
 import numpy as np
@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from slam_graph.arrays import FloatArray
 from slam_graph.datasets.rosbag.bag import Bag, Message
-from slam_graph.datasets.rosbag.messages import POSES, pose_of, pose_sigmas_of
+from slam_graph.datasets.rosbag.messages import POSES, covariance_of, pose_of, sigmas_of
 from slam_graph.datasets.rosbag.ros_topics import frame_of, path_between
 from slam_graph.datasets.streams.aiding_files import fixes_from, kept_of, known_poses_from
 from slam_graph.datasets.streams.vector_lengths import lengths_of
@@ -39,8 +39,6 @@ _POSE_SIGMAS = np.array([0.05] * 3 + [0.05] * 3)
 _ASSUMED = "poses without a covariance are taken as known to 0.05 m and 0.05 rad"
 _TYPES = {"gnss": (NAV_SAT_FIX,), "odometry": (ODOMETRY,), "poses": tuple(POSES)}
 """Of the messages of each sensor."""
-
-_Taken = TypeVar("_Taken")
 
 Messages = Callable[[list[str]], Iterable[Message]]
 
@@ -114,9 +112,9 @@ class BagAiding:
         covariances: list[FloatArray] = []
         for message in messages:
             stamps.append(stamp_ns(message))
-            place, covariance = _decoded(message, _fix_of, ([np.nan] * 3, _UNKNOWN))
-            places.append(place)
-            covariances.append(covariance)
+            fix = message.decode_or(_fix_of, _NO_FIX)
+            places.append(fix.place if fix.status >= 0 else [np.nan] * 3)
+            covariances.append(_covariance_of(fix))
         return fixes_from(
             np.array(stamps, np.int64),
             np.array(places).reshape(-1, 3),
@@ -129,14 +127,16 @@ class BagAiding:
         self, data: AidingData, messages: Iterable[Message], stamp_ns: Callable[[Message], int]
     ) -> AidingData:
         """With the poses of the sensor that `backend.known_poses` mounts on the body."""
-        kind = self._bag.topics[self._topics["poses"]]
+        take = partial(_known_pose_of, msgtype=self._bag.topics[self._topics["poses"]])
+        damaged = [np.nan] * 7, np.full((6, 6), np.nan)
         stamps: list[int] = []
         rows: list[list[float]] = []
         sigmas: list[FloatArray] = []
         for message in messages:
             stamps.append(stamp_ns(message))
-            rows.append(_decoded(message, partial(pose_of, msgtype=kind), [np.nan] * 7))
-            sigmas.append(_decoded(message, pose_sigmas_of, np.full(6, np.nan)))
+            pose, covariance = message.decode_or(take, damaged)
+            rows.append(pose)
+            sigmas.append(sigmas_of(covariance))
         if not stamps:
             raise DataError(f"{self._bag.path}: no poses on '{self._topics['poses']}'")
         poses, known = np.array(rows), np.array(sigmas)
@@ -160,11 +160,12 @@ class BagAiding:
         stamps: list[int] = []
         rows: list[list[float]] = []
         base: str | None = None
+        damaged: tuple[list[float], str | None] = ([np.nan] * 7, None)
         for message in messages:
             stamps.append(stamp_ns(message))
-            rows.append(_decoded(message, partial(pose_of, msgtype=ODOMETRY), [np.nan] * 7))
-            if base is None:
-                base = _decoded(message, lambda odometry: str(odometry.child_frame_id), None)
+            pose, frame = message.decode_or(_odometry_of, damaged)
+            rows.append(pose)
+            base = frame if base is None else base
         stamps_ns, poses = np.array(stamps, np.int64), np.array(rows).reshape(-1, 7)
         lengths = lengths_of(poses[:, 3:])
         good = np.isfinite(poses).all(axis=1) & np.isfinite(lengths)
@@ -185,30 +186,54 @@ class BagAiding:
         return path_between(self._bag, base, frame_of(self._bag, self._body), otherwise)
 
 
-def _decoded(message: Message, take: Callable[[Any], _Taken], otherwise: _Taken) -> _Taken:
-    """What a function takes from a message; something else where that is damaged."""
-    try:
-        return message.decode(take)
-    except DataError:
-        return otherwise
+def _known_pose_of(message: Any, msgtype: str) -> tuple[list[float], FloatArray]:
+    """Position and quaternion of a message with a pose, and its covariance (6, 6)."""
+    return pose_of(message, msgtype), covariance_of(message)
 
 
-def _fix_of(fix: Any) -> tuple[list[float], FloatArray]:
-    """Latitude, longitude, altitude and covariance; NaN where the receiver had no solution."""
-    if fix.status.status < 0:
-        return [np.nan] * 3, _UNKNOWN
-    return [fix.latitude, fix.longitude, fix.altitude], _covariance_of(fix)
+def _odometry_of(message: Any) -> tuple[list[float], str | None]:
+    """Position and quaternion of an `Odometry`, and the frame whose poses it has."""
+    return pose_of(message, ODOMETRY), str(message.child_frame_id)
 
 
-def _covariance_of(fix: Any) -> FloatArray:
-    """The covariance (3, 3) of a `NavSatFix`, east, north, up, m².
+class _Fix(NamedTuple):
+    """The fields of a `NavSatFix`.
+
+    Attributes:
+        status: negative where the receiver had no solution.
+        place: latitude, longitude and altitude.
+        covariance: (3, 3) east, north, up, m².
+        covariance_type: what is known of the covariance.
+    """
+
+    status: int
+    place: list[float]
+    covariance: FloatArray
+    covariance_type: int
+
+
+_NO_FIX = _Fix(-1, [np.nan] * 3, _UNKNOWN, _TYPE_UNKNOWN)
+
+
+def _fix_of(message: Any) -> _Fix:
+    """The fields of a `NavSatFix`."""
+    return _Fix(
+        int(message.status.status),
+        [float(message.latitude), float(message.longitude), float(message.altitude)],
+        np.asarray(message.position_covariance, np.float64).reshape(3, 3),
+        int(message.position_covariance_type),
+    )
+
+
+def _covariance_of(fix: _Fix) -> FloatArray:
+    """The covariance (3, 3) of a fix, east, north, up, m².
 
     The correlations are used if the message says that they are known, and the matrix is one.
     """
-    matrix = np.asarray(fix.position_covariance, np.float64).reshape(3, 3)
-    if fix.position_covariance_type == _TYPE_UNKNOWN or not (matrix.diagonal() > 0).all():
+    matrix = fix.covariance
+    if fix.covariance_type == _TYPE_UNKNOWN or not (matrix.diagonal() > 0).all():
         return _UNKNOWN
-    if fix.position_covariance_type == _TYPE_KNOWN and np.isfinite(matrix).all():
+    if fix.covariance_type == _TYPE_KNOWN and np.isfinite(matrix).all():
         symmetric = 0.5 * matrix + 0.5 * matrix.T
         values = np.linalg.eigvalsh(symmetric)
         if values[0] > _SMALLEST_RATIO * values[-1]:

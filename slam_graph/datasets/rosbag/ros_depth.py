@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam_graph.datasets.rosbag.bag import Bag
-from slam_graph.datasets.rosbag.messages import COMPRESSED_IMAGE, IMAGE
+from slam_graph.datasets.rosbag.messages import COMPRESSED_IMAGE, IMAGE, PackedImage, RawImage
 from slam_graph.datasets.rosbag.ros_topics import Topics, frame_of, own_camera, path_between
 from slam_graph.datasets.streams.depth_images import decode_depth
 from slam_graph.datasets.streams.images import Fault
@@ -94,28 +94,26 @@ def _sensor(bag: Bag, topic: str, topics: Topics, frames: list[str]) -> DepthSen
         raise DataError(f"{error}; it may have a key 'depth0' for the depth on '{topic}'") from None
 
 
-def depth_of(message: Any, where: str) -> NDArray[Any] | Fault:
-    """The raw depth image (height, width) in a message, uint16 or float32, or what is wrong.
+def depth_of(image: RawImage | PackedImage, where: str) -> NDArray[Any] | Fault:
+    """The raw depth image (height, width), uint16 or float32, or what is wrong.
 
     Args:
-        message: an `Image` or a `CompressedImage`.
+        image: the fields of a message.
         where: it comes from, for the fault.
     """
-    if not hasattr(message, "encoding"):
-        return _decompressed(bytes(message.data), str(message.format), where)
+    if isinstance(image, PackedImage):
+        return _decompressed(image.data, image.format, where)
     kinds = {"16UC1": np.uint16, "mono16": np.uint16, "32FC1": np.float32}
-    kind = kinds.get(message.encoding)
+    kind = kinds.get(image.encoding)
     if kind is None:
         known = ", ".join(kinds)
-        what = f"{where}: encoding '{message.encoding}' is not depth; known: {known}"
+        what = f"{where}: encoding '{image.encoding}' is not depth; known: {known}"
         return Fault("depth_unreadable", what)
-    number = np.dtype(kind).newbyteorder(">" if message.is_bigendian else "<")
-    row, data = message.width * number.itemsize, np.asarray(message.data, np.uint8)
-    if message.step < row or len(data) != message.step * message.height or len(data) == 0:
-        size = f"{message.width}x{message.height} {message.encoding}, rows of {message.step} bytes"
-        return Fault("depth_unreadable", f"{where}: {len(data)} bytes do not make {size}")
-    rows = np.ascontiguousarray(data.reshape(message.height, message.step)[:, :row])
-    return rows.view(number).astype(kind)
+    number = np.dtype(kind).newbyteorder(">" if image.is_bigendian else "<")
+    rows = image.rows(8 * number.itemsize, where)
+    if isinstance(rows, Fault):
+        return Fault("depth_unreadable", rows.message)
+    return np.ascontiguousarray(rows).view(number).astype(kind)
 
 
 def _decompressed(data: bytes, form: str, where: str) -> NDArray[Any] | Fault:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from slam_graph.datasets.calibration.kalibr_calibration import read_kalibr
 from slam_graph.datasets.rosbag.bag import REINDEX, Bag, Message
-from slam_graph.datasets.rosbag.messages import image_of, inertial_of, pose_of
+from slam_graph.datasets.rosbag.messages import image_fields, image_of, inertial_of, pose_of
 from slam_graph.datasets.rosbag.ros_aiding import BagAiding
 from slam_graph.datasets.rosbag.ros_depth import depth_of, find_depth
 from slam_graph.datasets.rosbag.ros_topics import find_topics, read_bag_rig
@@ -178,7 +178,7 @@ class RosBagSequence(GroupedSequence):
         with closing(self._until_damage([self._imu_topic])) as messages:
             while block := list(islice(messages, SAMPLES_PER_BLOCK)):
                 stamps = np.array([self._stamp_ns(message) for message in block], np.int64)
-                values = np.array([self._inertial(message) for message in block])
+                values = np.array([m.decode_or(inertial_of, [np.nan] * 6) for m in block])
                 yield partial(self._place, block), ImuData(stamps, values[:, :3], values[:, 3:])
 
     def _place(self, block: list[Message], index: int) -> str:
@@ -256,9 +256,10 @@ class RosBagSequence(GroupedSequence):
     def _depth(self, message: Message) -> Metres | Fault:
         where = self._where(message)
         try:
-            raw = message.decode(partial(depth_of, where=where))
+            fields = message.decode(image_fields)
         except DataError as error:
             return Fault("depth_unreadable", str(error))
+        raw = depth_of(fields, where)
         assert self._finish_depth is not None
         return raw if isinstance(raw, Fault) else self._finish_depth(raw, where)
 
@@ -289,16 +290,10 @@ class RosBagSequence(GroupedSequence):
 
     def _image(self, message: Message) -> Image | Fault:
         try:
-            return message.decode(partial(image_of, where=self._where(message)))
+            fields = message.decode(image_fields)
         except DataError as error:
             return Fault("image_unreadable", str(error))
-
-    def _inertial(self, message: Message) -> list[float]:
-        """Rate and specific force; NaN where the message is damaged."""
-        try:
-            return message.decode(inertial_of)
-        except DataError:
-            return [np.nan] * 6
+        return image_of(fields, self._where(message))
 
     @cached_property
     def _index(self) -> _Index:
@@ -359,22 +354,16 @@ class RosBagSequence(GroupedSequence):
     def _where(self, message: Message) -> str:
         return f"{self.path}: {message.topic} recorded at {message.received_ns}"
 
-    def _pose(self, message: Message) -> list[float]:
-        """Position and quaternion; NaN where the message is damaged."""
-        try:
-            return message.decode(partial(pose_of, msgtype=self._bag.topics[message.topic]))
-        except DataError:
-            return [np.nan] * 7
-
     def _read_poses(self) -> Trajectory:
         """The ground truth that was named."""
         topic = self._truth_topic
         assert topic is not None
+        take = partial(pose_of, msgtype=self._bag.topics[topic])
         stamps: list[int] = []
         values: list[list[float]] = []
         for message in self._until_damage([topic]):
             stamp_ns = self._stamp_ns(message)
-            pose = self._pose(message)
+            pose = message.decode_or(take, [np.nan] * 7)
             length = float(lengths_of(np.array([pose[3:]]))[0])
             if not np.isfinite([*pose, length]).all() or length < 0.5:
                 self.diagnostics.warn("groundtruth_not_finite", f"{self._where(message)}: dropped")

@@ -9,30 +9,31 @@ from __future__ import annotations
 
 import re
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, NamedTuple
 
 import gtsam
 import numpy as np
 import yaml
 
+from slam_graph.arrays import FloatArray
 from slam_graph.datasets.calibration.calibration_yaml import YamlValue, read_yaml
-from slam_graph.datasets.rosbag.bag import REINDEX, Bag
+from slam_graph.datasets.rosbag.bag import REINDEX, Bag, Message
 from slam_graph.datasets.rosbag.messages import (
     CAMERA_INFO,
     COMPRESSED_IMAGE,
     IMAGE,
     IMU,
     POSES,
+    TRANSFORM,
     TRANSFORMS,
+    pose_of,
 )
 from slam_graph.errors import DataError
 from slam_graph.sensors import CAMERA_MODELS, Camera, ImuNoise, Rig, RigCamera
-
-_Taken = TypeVar("_Taken")
 
 
 @dataclass(frozen=True, slots=True)
@@ -142,15 +143,20 @@ def read_bag_rig(bag: Bag, topics: Topics, noise: ImuNoise) -> Rig:
     transforms = _static_transforms(bag)
     mounted = []
     for k, topic in enumerate(topics.cameras):
-        camera = own_camera(bag, topic)
-        body_T_camera = _path(bag, transforms, body, frame_of(bag, _beside(bag, topic)))
+        info = _info_beside(bag, topic)
+        camera = _camera(bag, topic, info)
+        body_T_camera = _path(bag, transforms, body, info.frame)
         mounted.append(RigCamera(camera, body_T_camera, 0.0, f"cam{k}"))
     return Rig(tuple(mounted), noise)
 
 
 def frame_of(bag: Bag, topic: str) -> str:
     """The frame of the messages on a topic."""
-    return _first(bag, topic, lambda message: _plain(str(message.header.frame_id)))
+    return _first(bag, topic).decode(_frame_of)
+
+
+def _frame_of(message: Any) -> str:
+    return _plain(str(message.header.frame_id))
 
 
 def own_camera(bag: Bag, topic: str) -> Camera:
@@ -159,8 +165,7 @@ def own_camera(bag: Bag, topic: str) -> Camera:
     Raises:
         DataError: if there is none, or it cannot be used.
     """
-    rectified = "rect" in topic.rpartition("/")[2]
-    return _first(bag, _beside(bag, topic), lambda info: _camera(bag, info, rectified))
+    return _camera(bag, topic, _info_beside(bag, topic))
 
 
 _OTHERWISE = "give --calibration"
@@ -181,13 +186,13 @@ def path_between(bag: Bag, begin: str, end: str, otherwise: str = _OTHERWISE) ->
     return _path(bag, _static_transforms(bag), begin, end, otherwise)
 
 
-def _first(bag: Bag, topic: str, take: Callable[[Any], _Taken]) -> _Taken:
-    """What a function takes from the first message of a topic, which has one."""
+def _first(bag: Bag, topic: str) -> Message:
+    """The first message of a topic, which has one."""
     with closing(bag.messages([topic])) as messages:
         message = next(messages, None)
     if message is None:
         raise DataError(f"{bag.path}: no message on '{topic}' can be read; {REINDEX}")
-    return message.decode(take)
+    return message
 
 
 def _beside(bag: Bag, topic: str) -> str:
@@ -202,14 +207,52 @@ def _beside(bag: Bag, topic: str) -> str:
     return beside
 
 
-def _camera(bag: Bag, info: Any, rectified: bool) -> Camera:
-    """Intrinsics of a `CameraInfo`; ROS 1 writes its matrices in capitals."""
+class _CameraInfo(NamedTuple):
+    """The fields of a `CameraInfo`.
+
+    Attributes:
+        frame: of the camera.
+        size: width and height.
+        K: (3, 3) intrinsics of the images as they are taken.
+        D: coefficients of their distortion.
+        P: (3, 4) projection into rectified images.
+        distortion_model: by the name that ROS has for it.
+    """
+
+    frame: str
+    size: tuple[int, int]
+    K: FloatArray
+    D: FloatArray
+    P: FloatArray
+    distortion_model: str
+
+
+def _info_beside(bag: Bag, topic: str) -> _CameraInfo:
+    """The `CameraInfo` beside a topic of images."""
+    return _first(bag, _beside(bag, topic)).decode(_camera_info_of)
+
+
+def _camera_info_of(message: Any) -> _CameraInfo:
+    """The fields of a `CameraInfo`; ROS 1 writes its matrices in capitals."""
     K, D, P = (
-        np.asarray(getattr(info, name if hasattr(info, name) else name.upper()), np.float64)
+        np.asarray(getattr(message, name if hasattr(message, name) else name.upper()), np.float64)
         for name in "kdp"
     )
-    size = (int(info.width), int(info.height))
-    fx, fy, cx, cy = (P[[0, 5, 2, 6]] if rectified else K[[0, 4, 2, 5]]).tolist()
+    return _CameraInfo(
+        _frame_of(message),
+        (int(message.width), int(message.height)),
+        K.reshape(3, 3),
+        D.ravel(),
+        P.reshape(3, 4),
+        str(message.distortion_model),
+    )
+
+
+def _camera(bag: Bag, topic: str, info: _CameraInfo) -> Camera:
+    """The intrinsics of the camera whose images are on a topic."""
+    rectified = "rect" in topic.rpartition("/")[2]
+    matrix, D, size = info.P if rectified else info.K, info.D, info.size
+    fx, fy, cx, cy = matrix[[0, 1, 0, 1], [0, 1, 2, 2]].tolist()
     if rectified or not np.any(D):
         return Camera(fx, fy, cx, cy, "none", (), *size)
     models = {name: model for _, model in CAMERA_MODELS.working() for name in model.ros_names}
@@ -231,21 +274,19 @@ def _static_transforms(bag: Bag) -> dict[str, dict[str, gtsam.Pose3]]:
     if bag.topics.get(_STATIC_TOPIC) != TRANSFORMS:
         return known
     for message in bag.messages([_STATIC_TOPIC]):
-        for parent, child, pose in message.decode(_transforms_of):
+        for parent, child, (*place, x, y, z, w) in message.decode(_transforms_of):
+            pose = gtsam.Pose3(gtsam.Rot3.Quaternion(w, x, y, z), np.array(place))
             known.setdefault(parent, {})[child] = pose
             known.setdefault(child, {})[parent] = pose.inverse()
     return known
 
 
-def _transforms_of(message: Any) -> list[tuple[str, str, gtsam.Pose3]]:
-    """Parent, child and parent_T_child of the transforms in a message."""
-    found = []
-    for stamped in message.transforms:
-        move, turn = stamped.transform.translation, stamped.transform.rotation
-        rotation = gtsam.Rot3.Quaternion(turn.w, turn.x, turn.y, turn.z)
-        pose = gtsam.Pose3(rotation, np.array([move.x, move.y, move.z]))
-        found.append((_plain(stamped.header.frame_id), _plain(stamped.child_frame_id), pose))
-    return found
+def _transforms_of(message: Any) -> list[tuple[str, str, list[float]]]:
+    """Parent, child, position and quaternion (x, y, z, w) of the transforms in a message."""
+    return [
+        (_frame_of(part), _plain(str(part.child_frame_id)), pose_of(part, TRANSFORM))
+        for part in message.transforms
+    ]
 
 
 def _path(
