@@ -183,6 +183,22 @@ def test_the_residual_of_the_truth_is_chi_squared(
     assert kstest(squares, chi2(15).cdf).pvalue > 0.01
 
 
+def test_a_gap_has_the_noise_of_the_samples_that_are_missing() -> None:
+    """Of a constant signal: also where the position lies once the velocity is known."""
+    ends, all_of_it = ([0, 5 * 10**7], list(range(0, 5 * 10**7 + 1, 5 * 10**6)))
+    covariances = []
+    for stamps in (ends, all_of_it):
+        constant = np.tile([0.3, -0.2, 9.0], (len(stamps), 1))
+        samples = ImuData(np.array(stamps, dtype=np.int64), 0.1 * constant, constant)
+        covariances.append(samples.preintegrated(NO_BIAS, PARAMS).preintMeasCov())
+    gap, sampled = covariances
+    np.testing.assert_allclose(np.diag(gap)[:9], np.diag(sampled)[:9], rtol=0.15)
+    for P in covariances:  # of the position, given rotation and velocity
+        known = np.r_[0:3, 6:9]
+        P[3:6, 3:6] -= P[3:6][:, known] @ np.linalg.solve(P[np.ix_(known, known)], P[known, 3:6])
+    np.testing.assert_allclose(np.diag(gap)[3:6], np.diag(sampled)[3:6], rtol=0.2)
+
+
 def test_the_scale_multiplies_all_densities() -> None:
     samples = Flight().imu(0.0, 0.2)
     single = samples.preintegrated(NO_BIAS, NOISE.preintegration_params(9.81)).preintMeasCov()

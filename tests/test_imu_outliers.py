@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -112,6 +113,19 @@ def error_m(*faults: str) -> float:
 def test_a_run_survives_them(fault: str) -> None:
     """Its path is hardly worse than without the fault."""
     assert error_m(f"{fault}:at_s=12") < 2.0 * error_m()
+
+
+def test_one_camera_leads_over_a_gap_in_a_turn(data_dir: Path) -> None:
+    """Nine tenths of a second without samples, of real tracks of one camera that turns."""
+    truth = data_dir / "euroc_inertial/V1_01_easy"
+    errors = []
+    for faults in ([], ["imu_missing:at_s=20,duration_s=0.9"]):
+        sequence = open_dataset("demo", groundtruth=truth, faults=faults)
+        result = run(sequence, load_config(overrides=["final_ba.enabled=false"]), duration_s=24.0)
+        known = sequence.groundtruth()
+        assert known is not None
+        errors.append(ape(known, result.trajectory, alignment="yaw").statistics.rmse)
+    assert errors[1] < 2.0 * errors[0]
 
 
 def test_recorded_flights_have_no_outliers() -> None:

@@ -18,6 +18,11 @@ from numpy.typing import NDArray
 from slam_graph.arrays import BoolArray, FloatArray, IntArray
 from slam_graph.sensors.aiding import AidingData
 
+_LONGEST_STEP_S = 0.02
+"""A longer time between two samples is integrated in several steps. The noise of a single one is
+that of a constant acceleration: it ties the position to the velocities at both ends, as if it were
+known to be half their sum times the duration."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ImuData:
@@ -81,6 +86,11 @@ class ImuData:
         """
         pim = gtsam.PreintegratedCombinedMeasurements(params, bias)
         durations_s, gyro, accel = self.steps()
+        if durations_s.max() > _LONGEST_STEP_S:
+            pieces = np.ceil(durations_s / _LONGEST_STEP_S - 1e-6).astype(int)
+            durations_s, gyro, accel = (
+                np.repeat(values, pieces, axis=0) for values in (durations_s / pieces, gyro, accel)
+            )
         # GTSAM turns the specific force by the attitude at the start of a step; this is half a
         # step on
         half_turn = 0.5 * durations_s[:, None] * (gyro - bias.gyroscope())
