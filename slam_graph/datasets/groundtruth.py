@@ -18,6 +18,7 @@ from slam_graph.datasets.streams.csv_rows import (
     STAMP_TEXT,
     Rows,
     read_rows,
+    refuse_wild_stamps,
     stamps_from_seconds,
 )
 from slam_graph.datasets.streams.vector_lengths import lengths_of
@@ -30,6 +31,9 @@ FOLDERS = ("state_groundtruth_estimate0", "mocap0", "vicon0")
 
 _EUROC_COLUMNS = {7: "pose", 10: "pose and velocity", 16: "pose, velocity and biases"}
 """Values after the time stamp of an EuRoC ground truth: p, q (w x y z), v, gyro and accel bias."""
+
+_LARGEST = 1e18
+"""Positions, velocities and biases are no larger; their squares fit into numbers of 32 bits."""
 
 _SMALLEST_QUATERNION = 0.5
 """A quaternion shorter than this is a missing value, not a rounded unit quaternion."""
@@ -144,6 +148,7 @@ def _parse_block(rows: Rows) -> tuple[IntArray, FloatArray]:
         return stamps_from_seconds(rows, table["stamp"]), table["values"]
     dtype = [("stamp", "i8"), ("values", "f8", (count,))]
     table = rows.parse(dtype, f"stamp [ns] and {count} numbers", columns)
+    refuse_wild_stamps(rows, table["stamp"])
     values = table["values"].copy()
     values[:, 3:7] = table["values"][:, [4, 5, 6, 3]]
     return table["stamp"], values
@@ -157,7 +162,7 @@ def _usable(
     diagnostics: Diagnostics,
 ) -> NDArray[np.intp]:
     """Indices of the rows that are finite, have a rotation, and are later than those before."""
-    whole = np.isfinite(values).all(axis=1)
+    whole = (np.abs(values) <= _LARGEST).all(axis=1)
     lengths = lengths_of(values[:, 3:7])
     whole &= (lengths > _SMALLEST_QUATERNION) & np.isfinite(lengths)
     for k in np.flatnonzero(~whole):

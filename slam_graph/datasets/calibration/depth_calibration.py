@@ -38,7 +38,7 @@ def read_depth_sensor(entry: YamlValue, cameras: int) -> DepthSensor:
     camera = default.camera if number is None else int(number.number())
     if number is not None and not (camera == number.number() and 0 <= camera < cameras):
         raise DataError(f"{number.where}: expected the number of a camera, 0 to {cameras - 1}")
-    units = default.scale if scale is None else _positive(scale, scale.number())
+    units = default.scale if scale is None else scale.positive()
     limits, noise = entry.get("range_m"), entry.get("noise")
     least, most = (default.min_m, default.max_m) if limits is None else limits.numbers(2)
     if limits is not None and not 0.0 <= least < most:
@@ -81,9 +81,3 @@ def depth_entry(sensor: DepthSensor) -> dict[str, Any]:
         "distortion_coeffs": entry.coefficients,
         "resolution": [int(sensor.lens.width), int(sensor.lens.height)],
     }
-
-
-def _positive(value: YamlValue, number: float) -> float:
-    if number <= 0.0:
-        raise DataError(f"{value.where}: expected a number above 0")
-    return number

@@ -177,6 +177,18 @@ def stamps_from_seconds(rows: Rows, texts: NDArray[np.bytes_]) -> NDArray[np.int
     return np.repeat(np.array(stamps, np.int64), np.diff(first, append=len(texts)))
 
 
+def refuse_wild_stamps(rows: Rows, stamps_ns: NDArray[np.int64]) -> None:
+    """Refuse stamps (N,) of `rows` whose differences do not fit into 64 bits.
+
+    Raises:
+        DataError: naming the line of the first.
+    """
+    wild = np.flatnonzero((stamps_ns <= -LARGEST_STAMP_NS) | (stamps_ns >= LARGEST_STAMP_NS))
+    if len(wild):
+        stamp = stamps_ns[wild[0]]
+        raise DataError(f"{rows.where(int(wild[0]))}: '{stamp}' is not a time in nanoseconds")
+
+
 def require_rows(path: Path) -> None:
     """Refuse a file that cannot be read or has no data rows."""
     if next(read_rows(path, 2), None) is None:
