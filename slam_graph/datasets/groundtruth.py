@@ -12,7 +12,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from slam_graph.arrays import FloatArray, IntArray
+from slam_graph.arrays import FloatArray, IntArray, measurable
 from slam_graph.datasets.calibration.euroc_calibration import read_body_T_sensor
 from slam_graph.datasets.streams.csv_rows import (
     STAMP_TEXT,
@@ -31,9 +31,6 @@ FOLDERS = ("state_groundtruth_estimate0", "mocap0", "vicon0")
 
 _EUROC_COLUMNS = {7: "pose", 10: "pose and velocity", 16: "pose, velocity and biases"}
 """Values after the time stamp of an EuRoC ground truth: p, q (w x y z), v, gyro and accel bias."""
-
-_LARGEST = 1e18
-"""Positions, velocities and biases are no larger; their squares fit into numbers of 32 bits."""
 
 _SMALLEST_QUATERNION = 0.5
 """A quaternion shorter than this is a missing value, not a rounded unit quaternion."""
@@ -162,7 +159,7 @@ def _usable(
     diagnostics: Diagnostics,
 ) -> NDArray[np.intp]:
     """Indices of the rows that are finite, have a rotation, and are later than those before."""
-    whole = (np.abs(values) <= _LARGEST).all(axis=1)
+    whole = measurable(values).all(axis=1)
     lengths = lengths_of(values[:, 3:7])
     whole &= (lengths > _SMALLEST_QUATERNION) & np.isfinite(lengths)
     for k in np.flatnonzero(~whole):

@@ -41,6 +41,7 @@ from typing import BinaryIO, ClassVar, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from slam_graph.arrays import measurable
 from slam_graph.datasets.calibration.calibration_yaml import YamlValue, read_yaml
 from slam_graph.datasets.calibration.kalibr_calibration import read_kalibr
 from slam_graph.datasets.formats.recorded_files import AGAIN, check_length
@@ -260,8 +261,8 @@ class TrackRecordingSequence(RecordedSequence):
             normalized = self.rig.cameras[camera].camera.undistort(pixels)
         else:
             normalized = np.ascontiguousarray(rows["normalized"])
-        if not (np.isfinite(pixels).all() and np.isfinite(normalized).all()):
-            raise DataError(f"{self.path / name}: a feature is not finite; {AGAIN}")
+        if not (measurable(pixels).all() and measurable(normalized).all()):
+            raise DataError(f"{self.path / name}: a feature is not finite, or too far; {AGAIN}")
         return FeatureObservations(ids, pixels, normalized)
 
     def _with_depth(self, seen: FeatureObservations, data: bytes) -> FeatureObservations:
