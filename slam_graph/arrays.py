@@ -11,12 +11,10 @@ import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 __all__ = [
-    "LARGEST",
     "BoolArray",
     "FloatArray",
     "GrowingTable",
     "IntArray",
-    "measurable",
     "median",
     "skew",
 ]
@@ -24,9 +22,6 @@ __all__ = [
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
-
-LARGEST = 1e18
-"""Numbers of files are no larger: their squares fit into floating-point numbers of 32 bits."""
 
 _ROWS_PER_BLOCK = 1024
 
@@ -87,11 +82,6 @@ def skew(v: FloatArray) -> FloatArray:
     matrix[..., 2, 1], matrix[..., 0, 2], matrix[..., 1, 0] = x, y, z
     matrix[..., 1, 2], matrix[..., 2, 0], matrix[..., 0, 1] = -x, -y, -z
     return matrix
-
-
-def measurable(values: FloatArray) -> BoolArray:
-    """Which values are finite, and not beyond `LARGEST`."""
-    return np.asarray(np.abs(values) <= LARGEST)
 
 
 def median(values: NDArray[Any]) -> FloatArray:

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from slam_graph.arrays import FloatArray, measurable
+from slam_graph.arrays import FloatArray
 from slam_graph.bundle_adjustment.bal_problem import CAMERA_DIM, BalEstimates, BalProblem
 from slam_graph.errors import DataError
 
@@ -26,6 +26,8 @@ _MAX_UNPACKED, _MIN_UNPACKED = 50, 2**20
 _HEADER = 3
 _OBSERVATION = 4
 """Numbers of the header and of an observation."""
+_MAX_NUMBER = 1e18
+"""Largest magnitude of a number, so that squares are finite, with 32 bits too."""
 _MAX_HEADER_BYTES = 200
 """The first line of a file of this format is shorter."""
 
@@ -79,7 +81,7 @@ def read_bal(path: Path | str) -> BalProblem:
             f"{_where(path, text, expected)}: {len(numbers) - expected} numbers more than the "
             "header promises"
         )
-    bad = np.flatnonzero(~measurable(numbers))
+    bad = np.flatnonzero(~(np.abs(numbers) <= _MAX_NUMBER))
     if len(bad):
         raise DataError(f"{_where(path, text, int(bad[0]))}: a number is not finite, or too large")
     seen, by_camera, by_point = np.split(

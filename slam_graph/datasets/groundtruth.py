@@ -12,11 +12,12 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from slam_graph.arrays import FloatArray, IntArray, measurable
+from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.datasets.calibration.euroc_calibration import read_body_T_sensor
 from slam_graph.datasets.streams.csv_rows import (
     STAMP_TEXT,
     Rows,
+    measurable,
     read_rows,
     refuse_wild_stamps,
     stamps_from_seconds,

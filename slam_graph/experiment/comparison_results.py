@@ -34,8 +34,7 @@ from numpy.typing import NDArray
 from slam_graph.errors import DataError
 from slam_graph.evaluation import ape, nees_of_run, synchronize
 from slam_graph.geometry import AlignmentMode, Trajectory
-from slam_graph.results import ResultFolder, RunResult
-from slam_graph.results.saved_metrics import fault_of_metrics
+from slam_graph.results import ResultFolder, RunResult, SavedRun
 
 SCHEMA_VERSION = 3
 
@@ -100,7 +99,7 @@ def _is_whole(table: Table) -> bool:
     return (
         isinstance(table.get("settings_hash"), str)
         and (steps is None or _is_number(steps))
-        and fault_of_metrics(table.get("metrics")) is None
+        and SavedRun.fault_of_metrics(table.get("metrics")) is None
     )
 
 

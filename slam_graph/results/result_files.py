@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from slam_graph import datasets
-from slam_graph.arrays import FloatArray, IntArray, measurable
+from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.errors import DataError
 from slam_graph.files import Files
 from slam_graph.geometry import NavState, StateHistory, Trajectory
@@ -235,6 +235,8 @@ def state_lines(history: StateHistory) -> Iterator[str]:
         yield ",".join([str(stamp_ns), *cells]) + "\n"
 
 
+LARGEST = 1e18
+"""Numbers of a result are no larger: their squares fit into numbers of 32 bits."""
 _LARGEST_NS = 2**62
 """Times are no larger, so that their differences fit."""
 
@@ -306,7 +308,7 @@ def _numbers(cells: Iterable[str]) -> FloatArray:
         ValueError: if a cell is none.
     """
     values = np.array([float(cell or "nan") for cell in cells], np.float64)
-    values[~measurable(values)] = np.nan
+    values[np.abs(values) > LARGEST] = np.nan
     return values
 
 

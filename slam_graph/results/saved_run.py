@@ -28,7 +28,7 @@ from slam_graph.results.run_picture import (
     with_path_in_map,
 )
 from slam_graph.results.run_summary import RunSummary
-from slam_graph.results.saved_metrics import read_metrics
+from slam_graph.results.saved_metrics import fault_of_metrics, read_metrics
 from slam_graph.sensors import Rig
 
 if TYPE_CHECKING:
@@ -66,6 +66,8 @@ class SavedRun(RunSummary):
     Attributes:
         folder: with the files.
     """
+
+    fault_of_metrics = staticmethod(fault_of_metrics)
 
     def __init__(self, folder: Path | str) -> None:
         self.folder = Path(folder)

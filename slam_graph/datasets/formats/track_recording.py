@@ -41,7 +41,6 @@ from typing import BinaryIO, ClassVar, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from slam_graph.arrays import measurable
 from slam_graph.datasets.calibration.calibration_yaml import YamlValue, read_yaml
 from slam_graph.datasets.calibration.kalibr_calibration import read_kalibr
 from slam_graph.datasets.formats.recorded_files import AGAIN, check_length
@@ -53,7 +52,7 @@ from slam_graph.datasets.sequence import (
     RecordedSequence,
     SequenceInfo,
 )
-from slam_graph.datasets.streams.csv_rows import LARGEST_STAMP_NS
+from slam_graph.datasets.streams.csv_rows import LARGEST_STAMP_NS, measurable
 from slam_graph.datasets.streams.imu_stream import clean_blocks
 from slam_graph.datasets.streams.mask_images import MASKS, MaskFolder, read_classes
 from slam_graph.errors import DataError

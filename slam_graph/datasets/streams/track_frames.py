@@ -11,8 +11,8 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from slam_graph.arrays import measurable
 from slam_graph.datasets.sequence import FrameStream
+from slam_graph.datasets.streams.csv_rows import measurable
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.sensors import FeatureFrame, FeatureObservations
 
