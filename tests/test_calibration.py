@@ -189,7 +189,14 @@ def test_euroc_rig_with_an_offset_imu(tmp_path: Path) -> None:
         ("[380.5, 380.25, 510.0, 514.0]", "[-1, 380.25, 510.0, 514.0]", 11, "must be positive"),
         ("[380.5, 380.25, 510.0, 514.0]", "[.nan, 380.25, 510.0, 514.0]", 11, "not a number"),
         ("-0.03, 0.004]", "-0.03]", 9, "expected 4 numbers, got 3"),
+        ("[380.5, 380.25, 510.0, 514.0]", "[1e-320, 380.25, 510.0, 514.0]", 11, "no lens has"),
+        ("[380.5, 380.25, 510.0, 514.0]", "[380.5, 380.25, -1e308, 514.0]", 11, "no lens has"),
+        ("-0.03, 0.004]", "-0.03, 4294967296]", 11, "no lens has"),
+        ("0.0, 0.5]", "0.0, 1e200]", 3, "a translation of more than"),
         ("[1024, 1020]", "large", 12, "expected a list"),
+        ("[1024, 1020]", "[1024.5, 1020]", 12, "two whole numbers"),
+        ("[1024, 1020]", "[0, 1020]", 12, "two whole numbers"),
+        ("[1024, 1020]", "[1024, 1e300]", 12, "two whole numbers"),
         ("-1.5e-3", "early", 14, "'early' is not a number"),
         ("cam_overlaps: [1]", "cam_overlaps: [1", 8, "not valid YAML"),
     ],
@@ -202,6 +209,21 @@ def test_faults_name_file_and_line(chain: Path, old: str, new: str, line: int, w
     assert f"{chain.name}:{line}: " in message
     assert what in message
     assert "\n" not in message
+
+
+@pytest.mark.parametrize("value", ["0", "-1e-3", "1e200", "1e-200"])
+@pytest.mark.parametrize("key", [line.partition(":")[0] for line in IMU.splitlines()[1:]])
+def test_noise_and_rate_are_above_zero(chain: Path, tmp_path: Path, key: str, value: str) -> None:
+    lines = [f"{key}: {value}" if line.startswith(key) else line for line in IMU.splitlines()]
+    (tmp_path / "imu.yaml").write_text("\n".join(lines))
+    with pytest.raises(DataError, match=rf"imu\.yaml:\d: {key}: '{value}' is not a usable number"):
+        read_kalibr(chain)
+
+
+def test_the_number_of_a_camera_has_few_digits(chain: Path) -> None:
+    chain.write_text(f"? cam{'1' * 5000}\n: {{camera_model: pinhole}}\n")
+    with pytest.raises(DataError, match="no camera"):
+        read_kalibr(chain)
 
 
 @pytest.mark.parametrize("content", ["", "- 1\n- 2\n", "text", "key: value\n"])

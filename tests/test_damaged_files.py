@@ -7,6 +7,7 @@ import shutil
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
+from textwrap import indent
 from typing import Any
 
 import cv2
@@ -18,19 +19,21 @@ from pose_graphs import laps
 from recordings import (
     CAMERA_YAML,
     FRAME_PERIOD_NS,
+    IMU_YAML,
     SIZE,
     START_NS,
     write_euroc,
+    write_groundtruth,
     write_openvins,
 )
 from recordings_loose import CHAIN, write_flight_video, write_image_folder, write_video
-from recordings_public import write_kitti_odometry, write_kitti_raw, write_tum_rgbd
+from recordings_public import as_tum_vi, write_kitti_odometry, write_kitti_raw, write_tum_rgbd
 from recordings_ros import BagWriter, write_bag
+from sound import sound_graph, sound_problem, sound_rig, sound_table, sound_trajectory
 
 from slam_graph.bundle_adjustment.bal_file import read_bal
 from slam_graph.config import load_config
 from slam_graph.datasets import TrackRecorder, open_dataset
-from slam_graph.datasets.calibration.euroc_calibration import read_body_T_sensor
 from slam_graph.datasets.calibration.kalibr_calibration import read_kalibr, write_kalibr
 from slam_graph.datasets.formats.eqvio import wheel_tracks
 from slam_graph.datasets.groundtruth import read_groundtruth
@@ -62,11 +65,10 @@ def read_all(path: Path, **options: Any) -> None:
     """Everything that a run reads of a recording."""
     sequence = open_dataset(path, **options)
     sequence.info()
+    sound_rig(sequence.rig)
     truth = sequence.groundtruth()
     if truth is not None:
-        assert np.all(np.diff(truth.stamps_ns) > 0)
-        assert np.isfinite(truth.positions).all()
-        np.testing.assert_allclose(np.linalg.norm(truth.quaternions, axis=1), 1.0, atol=0.02)
+        sound_trajectory(truth)
     start = sequence.initial_state()
     if start is not None:
         assert np.isfinite(start.world_T_body.matrix()).all()
@@ -80,24 +82,93 @@ def read_all(path: Path, **options: Any) -> None:
         assert np.isfinite([packet.imu.gyro, packet.imu.accel]).all()
 
 
+TRUTH = "state_groundtruth_estimate0"
+
+
 @pytest.mark.parametrize(
-    "name", ["cam0/data.csv", "cam0/sensor.yaml", "imu0/data.csv", "imu0/sensor.yaml"]
+    "name",
+    [
+        *(
+            f"{folder}/{file}"
+            for folder in ("cam0", "imu0")
+            for file in ("data.csv", "sensor.yaml")
+        ),
+        *("depth0/data.csv", "depth0/sensor.yaml", f"{TRUTH}/data.csv", f"{TRUTH}/sensor.yaml"),
+    ],
 )
 def test_euroc(tmp_path: Path, name: str) -> None:
     root = write_euroc(tmp_path / "flight", frames=3, cameras=1, imu_lead=4)
+    if name.startswith("depth0"):
+        with_depth(root / "mav0")
+    if name.startswith(TRUTH):
+        write_groundtruth(root / "mav0", 16, 8)
+        tracked = CAMERA_YAML.format(y=0.1) if name.endswith("yaml") else IMU_YAML
+        (root / "mav0" / TRUTH / "sensor.yaml").write_text(tracked)
     tried(root / "mav0" / name, lambda: read_all(root))
 
 
-def test_sensor_yaml(tmp_path: Path) -> None:
-    path = tmp_path / "sensor.yaml"
-    path.write_text(CAMERA_YAML.format(y=0.1))
-    tried(path, lambda: read_body_T_sensor(path))
+def with_depth(mav0: Path) -> None:
+    """Depth images, registered by the reader."""
+    (mav0 / "depth0" / "data").mkdir(parents=True)
+    lens = CAMERA_YAML.format(y=0.1).partition("resolution")
+    keys = "camera: 0\nscale: 1000\nrange_m: [0.3, 8]\nnoise: [0.002, 0.003]\n"
+    mounting = "T_cam_depth: [[1, 0, 0, 0.02], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]\n"
+    (mav0 / "depth0" / "sensor.yaml").write_text(keys + mounting + "".join(lens[1:]))
+    shutil.copy(mav0 / "cam0" / "data.csv", mav0 / "depth0" / "data.csv")
+    for image in (mav0 / "cam0" / "data").iterdir():
+        raw = np.full(SIZE[::-1], 2000, np.uint16)
+        assert cv2.imwrite(str(mav0 / "depth0" / "data" / image.name), raw)
+
+
+@pytest.mark.parametrize("name", ["camchain.yaml", "imu_config.yaml"])
+def test_tum_vi(tmp_path: Path, name: str) -> None:
+    root = as_tum_vi(write_euroc(tmp_path / "flight", frames=2, cameras=1, imu_lead=4))
+    tried(root / "dso" / name, lambda: read_all(root))
 
 
 def test_kalibr(tmp_path: Path) -> None:
     path = tmp_path / "camchain.yaml"
     write_kalibr(simulate(duration_s=1.0).rig, path)
-    tried(path, lambda: read_kalibr(path))
+    tried(path, lambda: sound_rig(read_kalibr(path)))
+
+
+CAMCHAIN = """cam0:
+  T_cam_imu: unknown
+  cam_overlaps: [1]
+  camera_model: omni
+  intrinsics: [1.2, 400, 401, 320, 240]
+  distortion_coeffs: [-0.1, 0.02, 1e-4, 2e-4]
+  distortion_model: radtan
+  resolution: [640, 480]
+  rostopic: /cam0/image_raw
+  line_delay: 2.1e-5
+  stamped_row: middle
+cam1:
+  T_cn_cnm1: [[1, 0, 0, -0.1], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
+  camera_model: ds
+  intrinsics: [-0.2, 0.55, 300, 301, 320, 240]
+  distortion_coeffs: []
+  distortion_model: none
+  resolution: [640, 480]
+  timeshift_cam_imu: 0.01
+cam2:
+  T_cam_imu: [[1, 0, 0, 0.3], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
+  camera_model: pinhole
+  intrinsics: [300, 301, 320, 240]
+  distortion_coeffs: [-0.01, 0.02, -0.003, 0.001]
+  distortion_model: equidistant
+  resolution: [640, 480]
+  shutter: rolling
+depth0:
+  {camera: 2, scale: 5000, range_m: [0.5, 6], noise: [0.002, 0.003]}
+"""
+
+
+@pytest.mark.parametrize("name", ["camchain.yaml", "imu.yaml"])
+def test_kalibr_with_lenses_of_all_kinds(tmp_path: Path, name: str) -> None:
+    (tmp_path / "camchain.yaml").write_text(CAMCHAIN)
+    (tmp_path / "imu.yaml").write_text("imu0:\n" + indent(IMU_YAML, "  "))
+    tried(tmp_path / name, lambda: sound_rig(read_kalibr(tmp_path / "camchain.yaml")))
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
@@ -105,17 +176,27 @@ def test_g2o(tmp_path: Path, dimension: int) -> None:
     path = tmp_path / "graph.g2o"
     graph, truth = laps(dimension, 0.01, poses=12, lap=5)
     path.write_text("".join(g2o_lines(graph, truth)))
-    tried(path, lambda: read_pose_graph(path))
+    tried(path, lambda: sound_graph(read_pose_graph(path)))
 
 
-def test_toro(tmp_path: Path) -> None:
+TORO = (
+    "VERTEX2 0 0 0 0\nVERTEX2 1 1 0 0.1\nVERTEX2 2 2 0 0.2\n"
+    "EDGE2 0 1 1 0 0.1 100 0 100 400 0 0\nEDGE2 1 2 1 0 0.1 100 0 100 400 0 0\n"
+    "EDGE2 0 2 2 0 0.2 100 0 100 400 0 0\n"
+)
+TORO_3D = (
+    "VERTEX3 0 0 0 0 0 0 0\nVERTEX3 1 1 0 0.1 0 0.1 0.2\nVERTEX3 2 2 0 0.2 0 0 0.3\n"
+    "EDGE3 0 1 1 0 0.1 0 0.1 0.2 9 0 0 0 0 0 9 0 0 0 0 9 0 0 0 9 0 0 9 0 9\n"
+    "EDGE3 1 2 1 0 0.1 0 -0.1 0.1 9 0 0 0 0 0 9 0 0 0 0 9 0 0 0 9 0 0 9 0 9\n"
+    "EDGE3 0 2 2 0 0.2 0 0 0.3 9 0 0 0 0 0 9 0 0 0 0 9 0 0 0 9 0 0 9 0 9\n"
+)
+
+
+@pytest.mark.parametrize("text", [TORO, TORO_3D], ids=["2D", "3D"])
+def test_toro(tmp_path: Path, text: str) -> None:
     path = tmp_path / "graph.graph"
-    path.write_text(
-        "VERTEX2 0 0 0 0\nVERTEX2 1 1 0 0.1\nVERTEX2 2 2 0 0.2\n"
-        "EDGE2 0 1 1 0 0.1 100 0 100 400 0 0\nEDGE2 1 2 1 0 0.1 100 0 100 400 0 0\n"
-        "EDGE2 0 2 2 0 0.2 100 0 100 400 0 0\n"
-    )
-    tried(path, lambda: read_pose_graph(path))
+    path.write_text(text)
+    tried(path, lambda: sound_graph(read_pose_graph(path)))
 
 
 def test_bal(tmp_path: Path) -> None:
@@ -124,7 +205,7 @@ def test_bal(tmp_path: Path) -> None:
         "2 2 4\n0 0 10 20\n0 1 -10 20\n1 0 12 20\n1 1 -12 20\n"
         "0 0 0 0 0 0 500 0 0\n0 0 0 1 0 0 500 0 0\n0 0 -10\n1 1 -10\n"
     )
-    tried(path, lambda: read_bal(path))
+    tried(path, lambda: sound_problem(read_bal(path)))
 
 
 @pytest.mark.parametrize("separator", [" ", ","])
@@ -133,7 +214,7 @@ def test_trajectories(tmp_path: Path, separator: str) -> None:
     unit = "" if separator == " " else "000000000"
     rows = ([f"{1403636580 + k}{unit}", k, 0.5, -1e-3, 0, 0, 0, 1] for k in range(8))
     path.write_text("".join(separator.join(map(str, row)) + "\n" for row in rows))
-    tried(path, lambda: read_groundtruth(path))
+    tried(path, lambda: sound_trajectory(read_groundtruth(path)))
 
 
 @pytest.fixture(scope="module")
@@ -310,7 +391,7 @@ def test_configurations(tmp_path: Path) -> None:
         "algorithm: msckf\nseed: 1\nstart_s: 0.5\nduration_s: null\ncameras: stereo\n"
         "backend:\n  noise: {pixel_sigma: 1.5, gravity: 9.81}\nfrontend:\n  max_features: 100\n"
     )
-    tried(path, lambda: load_config(path))
+    tried(path, lambda: sound_table(load_config(path).model_dump(mode="json")))
 
 
 def everything(bag: BagWriter) -> None:

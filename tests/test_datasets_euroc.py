@@ -166,6 +166,27 @@ def test_bad_cell_names_file_and_line(folder: Path) -> None:
     one_line(error, "imu0/data.csv:33", "'9.8x' in column 7 is not a number")
 
 
+@pytest.mark.parametrize("stamp", ["9223372036854775807", "-9223372036854775808"])
+def test_stamps_whose_differences_do_not_fit_are_refused(folder: Path, stamp: str) -> None:
+    sequence, _ = run_through(folder)
+    truth = folder / "mav0" / "state_groundtruth_estimate0" / "data.csv"
+    for file in (imu_file(folder), truth):
+        values = file.read_text().splitlines()[29].partition(",")[2]
+        edit_line(file, 30, f"{stamp},{values}")
+    with pytest.raises(DataError, match=r"imu0/data\.csv:30: .* is not a time in nanoseconds"):
+        run_through(folder)
+    with pytest.raises(DataError, match=r"estimate0/data\.csv:30: .* is not a time in nanoseconds"):
+        sequence.groundtruth()
+
+
+def test_states_beyond_any_number_of_use_are_dropped(folder: Path) -> None:
+    truth = folder / "mav0" / "state_groundtruth_estimate0" / "data.csv"
+    edit_line(truth, 4, truth.read_text().splitlines()[3].replace(",0.2,", ",1e200,"))
+    sequence, _ = run_through(folder)
+    sequence.groundtruth()
+    assert sequence.diagnostics.counts["groundtruth_not_finite"] == 1
+
+
 def test_missing_column_names_file_and_line(folder: Path) -> None:
     edit_line(imu_file(folder), 2, imu_row(folder, 2).rsplit(",", 1)[0])
     with pytest.raises(DataError) as error:

@@ -27,6 +27,7 @@ from slam_graph.datasets import (
     read_kalibr,
 )
 from slam_graph.datasets.formats.track_recording import DEPTHS
+from slam_graph.datasets.streams.depth_images import Registration
 from slam_graph.errors import DataError
 from slam_graph.sensors import Camera, CameraFrame, DepthSensor, FeatureFrame, Rig
 from slam_graph.simulation import simulate
@@ -164,6 +165,9 @@ def test_a_rig_with_depth_and_without_imu_is_written_and_read_again(tmp_path: Pa
         ("scale: 0", "above 0"),
         ("range_m: [3, 1]", "least and the largest"),
         ("noise: [0, 0]", "noise in m"),
+        ("range_m: [0.3, 1e308]", "least and the largest"),
+        ("noise: [1e308, 0]", "noise in m"),
+        ("scale: 1e18", "units to a metre"),
     ],
 )
 def test_depth_calibration_that_makes_no_sense(tmp_path: Path, line: str, match: str) -> None:
@@ -171,6 +175,13 @@ def test_depth_calibration_that_makes_no_sense(tmp_path: Path, line: str, match:
     with pytest.raises(DataError, match=match) as error:
         read_kalibr(tmp_path / "rig.yaml")
     assert "rig.yaml:9" in str(error.value)
+
+
+def test_a_depth_sensor_that_is_far_coarser_than_its_camera_is_refused() -> None:
+    """To fill the pixels between its points would take hours."""
+    camera = Camera(50.0, 51.0, 32.5, 23.5, "none", (), 64, 48)
+    with pytest.raises(DataError, match="5000 times shorter"):
+        Registration(replace(camera, fx=0.01), camera, gtsam.Pose3())
 
 
 def test_tracks_with_depth_are_replayed_to_the_last_bit(tmp_path: Path) -> None:

@@ -108,7 +108,15 @@ def test_toro_without_information_has_the_identity(gtsam_data: Path) -> None:
         (V2 + "EDGE_SE2 0 0 1 0 0 1 0 0 1 0 1\n", "no edges between two poses"),
         (V2 + V3 + E3, "2D and 3D"),
         (V3 + E3.replace("0 0 0 1 1", "0 0 0 0 1"), "graph.g2o:3: the quaternion is not of"),
-        (V3.replace("0 1\n", "0 1e300\n") + E3, "graph.g2o:1: the quaternion is not of"),
+        (V3.replace("0 1\n", "0 1e17\n") + E3, "graph.g2o:1: the quaternion is not of"),
+        (
+            V3.replace("0 1\n", "0 1e300\n") + E3,
+            "graph.g2o:1: a number is not finite, or too large",
+        ),
+        (
+            V2 + E2.replace("4 0 9", "4 0 1e308"),
+            "graph.g2o:3: a number is not finite, or too large",
+        ),
     ],
 )
 def test_bad_files_are_refused_with_their_line(tmp_path: Path, text: str, message: str) -> None:

@@ -26,8 +26,8 @@ _MAX_UNPACKED, _MIN_UNPACKED = 50, 2**20
 _HEADER = 3
 _OBSERVATION = 4
 """Numbers of the header and of an observation."""
-_MAX_NUMBER = 1e100
-"""Largest magnitude of a number, so that squares are finite."""
+_MAX_NUMBER = 1e18
+"""Largest magnitude of a number, so that squares are finite, with 32 bits too."""
 _MAX_HEADER_BYTES = 200
 """The first line of a file of this format is shorter."""
 

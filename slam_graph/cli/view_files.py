@@ -6,10 +6,10 @@ from __future__ import annotations
 
 import csv
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 from zipfile import BadZipFile, is_zipfile
 
 if TYPE_CHECKING:
@@ -137,6 +137,8 @@ def _optimized_graph(folder: Path) -> _Show:
     try:
         with edges.open(encoding="utf-8", newline="") as file:
             weights = np.array([float(row["weight"]) for row in csv.DictReader(file)])
+        if not ((weights >= 0.0) & (weights <= 1.0)).all():
+            raise ValueError("a weight is not from 0 to 1")
     except OSError as error:
         raise DataError(f"{edges}: cannot be read ({error.strerror})") from error
     except (ValueError, KeyError, TypeError, csv.Error) as error:
@@ -220,16 +222,14 @@ def _comparison(folder: Path) -> _Show:
             continue
         try:
             with file.open("rb") as data, np.load(data, allow_pickle=False) as series:
-                run = {
-                    "path": series.get("path", np.zeros(0)).reshape(-1, 3),
-                    "time_s": np.zeros(0),
-                }
+                run = {"path": _numbers(series, "path", 3), "time_s": np.zeros(0)}
                 if "time_s" in series and "translation_m" in series:
-                    columns = np.stack([series[name] for name in _ERRORS])
+                    columns = np.stack([_numbers(series, name, 1)[:, 0] for name in _ERRORS])
                     run |= dict(zip(_ERROR_TITLES, columns, strict=True))
                 elif len(run["path"]) == 0:
                     continue  # without motion
-                true_path = series.get("true_path", true_path)
+                if "true_path" in series:
+                    true_path = _numbers(series, "true_path", 3)
         except (*_DAMAGED, BadZipFile, zlib.error) as error:
             raise DataError(f"{file}: not the series of a run ({error})") from error
         runs[file.stem] = run
@@ -237,3 +237,20 @@ def _comparison(folder: Path) -> _Show:
         raise DataError(f"{folder}: nothing to show: no run has a path")
     true_paths = {} if true_path is None else {"ground truth": true_path}
     return lambda recording: recording.show_comparison(runs, true_paths)
+
+
+def _numbers(series: Mapping[str, Any], name: str, width: int) -> FloatArray:
+    """(N, width) numbers of a series of a comparison; none if it is not there.
+
+    Raises:
+        ValueError: if it is of another kind.
+    """
+    import numpy as np
+
+    if name not in series:
+        return np.zeros((0, width))
+    values = np.asarray(series[name])
+    rows = values[:, None] if values.ndim == 1 and width == 1 else values
+    if values.dtype.kind not in "fiu" or rows.ndim != 2 or rows.shape[1] != width:
+        raise ValueError(f"'{name}' is not of numbers, or has another shape")
+    return np.asarray(rows, np.float64)

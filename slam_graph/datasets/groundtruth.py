@@ -17,7 +17,9 @@ from slam_graph.datasets.calibration.euroc_calibration import read_body_T_sensor
 from slam_graph.datasets.streams.csv_rows import (
     STAMP_TEXT,
     Rows,
+    measurable,
     read_rows,
+    refuse_wild_stamps,
     stamps_from_seconds,
 )
 from slam_graph.datasets.streams.vector_lengths import lengths_of
@@ -144,6 +146,7 @@ def _parse_block(rows: Rows) -> tuple[IntArray, FloatArray]:
         return stamps_from_seconds(rows, table["stamp"]), table["values"]
     dtype = [("stamp", "i8"), ("values", "f8", (count,))]
     table = rows.parse(dtype, f"stamp [ns] and {count} numbers", columns)
+    refuse_wild_stamps(rows, table["stamp"])
     values = table["values"].copy()
     values[:, 3:7] = table["values"][:, [4, 5, 6, 3]]
     return table["stamp"], values
@@ -157,7 +160,7 @@ def _usable(
     diagnostics: Diagnostics,
 ) -> NDArray[np.intp]:
     """Indices of the rows that are finite, have a rotation, and are later than those before."""
-    whole = np.isfinite(values).all(axis=1)
+    whole = measurable(values).all(axis=1)
     lengths = lengths_of(values[:, 3:7])
     whole &= (lengths > _SMALLEST_QUATERNION) & np.isfinite(lengths)
     for k in np.flatnonzero(~whole):

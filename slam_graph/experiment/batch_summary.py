@@ -105,7 +105,7 @@ def _measured(metrics: Mapping[str, Any]) -> Row:
 
 def _errors(accuracy: Mapping[str, Any] | None, mode: str) -> tuple[float | None, float | None]:
     """Root mean square errors of position, m, and orientation, degrees; None without a truth."""
-    table = (accuracy or {}).get(mode)
-    if table is None or "unavailable" in table:
+    errors = (accuracy or {}).get(mode, {}).get("ate")
+    if errors is None:  # no truth, or the alignment is unavailable
         return None, None
-    return table["ate"]["translation_m"]["rmse"], table["ate"]["rotation_deg"]["rmse"]
+    return errors["translation_m"]["rmse"], errors["rotation_deg"]["rmse"]

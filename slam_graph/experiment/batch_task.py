@@ -152,10 +152,10 @@ def _read_mark(folder: Path) -> dict[str, Any] | None:
     """The mark of a folder of results; None if it has none of this version."""
     try:
         mark = json.loads((folder / MARK).read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+    except (OSError, ValueError, RecursionError):
         return None
     valid = isinstance(mark, dict) and mark.get("schema_version") == SCHEMA_VERSION
-    return mark if valid else None
+    return mark if valid and {"status", "settings_hash"} <= mark.keys() else None
 
 
 @contextmanager

@@ -90,8 +90,9 @@ def write_report(comparison: Comparison) -> None:
 
 def _versions(comparison: Comparison) -> dict[str, str]:
     """Versions of what the first run that was done depends on."""
-    found = (read_result(task.result) for task in comparison.runs if task.is_done())
-    return next((result["metrics"]["versions"] for result in found if result is not None), {})
+    results = (read_result(task.result) for task in comparison.runs if task.is_done())
+    found = (result["metrics"] for result in results if result is not None)
+    return next((metrics.get("versions", {}) for metrics in found), {})
 
 
 def _cells(row: Table) -> tuple[str, ...]:
@@ -146,7 +147,7 @@ def _row(data: str, algorithm: str, tasks: list[RunTask]) -> Table:
         "ate_m": {mode: _mean(good, _ate(mode, "translation_m")) for mode in ALIGNMENTS},
         "orientation_deg": {mode: _mean(good, _ate(mode, "rotation_deg")) for mode in ALIGNMENTS},
         "in_world_of_fixes": {
-            name: _mean([m for m in good if m["world"].get("of_truth")], _ate("none", part))
+            name: _mean([m for m in good if m.get("world", {}).get("of_truth")], _ate("none", part))
             for name, part in (("ate_m", "translation_m"), ("orientation_deg", "rotation_deg"))
         },
         "nees": {

@@ -34,7 +34,7 @@ from numpy.typing import NDArray
 from slam_graph.errors import DataError
 from slam_graph.evaluation import ape, nees_of_run, synchronize
 from slam_graph.geometry import AlignmentMode, Trajectory
-from slam_graph.results import ResultFolder, RunResult
+from slam_graph.results import ResultFolder, RunResult, SavedRun
 
 SCHEMA_VERSION = 3
 
@@ -42,6 +42,12 @@ ALIGNMENTS: tuple[AlignmentMode, ...] = ("none", "yaw", "se3", "sim3")
 
 STAGE = "backend"
 """The stage of the pipeline in which algorithms differ."""
+
+_DAMAGED = (
+    *(OSError, ValueError, RecursionError, EOFError),
+    *(BadZipFile, zlib.error, NotImplementedError),
+)
+"""What is raised for files that are not JSON, or no archive of arrays."""
 
 Series = dict[str, NDArray[Any]]
 """Arrays by the names above."""
@@ -81,10 +87,24 @@ def read_result(path: Path) -> Table | None:
         table = json.loads(path.read_text(encoding="utf-8"))
         with ZipFile(path.with_suffix(".npz")) as series:
             damaged = series.testzip() is not None
-    except (OSError, ValueError, BadZipFile, zlib.error, NotImplementedError, EOFError):
+    except _DAMAGED:
         return None
     valid = isinstance(table, dict) and table.get("schema_version") == SCHEMA_VERSION
-    return table if valid and not damaged else None
+    return table if valid and not damaged and _is_whole(table) else None
+
+
+def _is_whole(table: Table) -> bool:
+    """Whether the content of a JSON file is what `write_result` wrote."""
+    steps = table.get("mean_steps")
+    return (
+        isinstance(table.get("settings_hash"), str)
+        and (steps is None or _is_number(steps))
+        and SavedRun.fault_of_metrics(table.get("metrics")) is None
+    )
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)
 
 
 def read_series(path: Path) -> Series:
@@ -176,5 +196,5 @@ def numbers(metrics: list[Table], get: Callable[[Table], Any]) -> Iterator[float
             value = get(table)
         except (KeyError, TypeError):
             continue  # no ground truth, no covariance, or nothing to align
-        if value is not None:
+        if _is_number(value):
             yield value

@@ -79,6 +79,9 @@ _LINES = {
 }
 
 
+_LARGEST_POSE, _LARGEST_INFORMATION = 1e18, 1e50
+"""Magnitudes of numbers of poses and of information, so that costs are finite."""
+
 _QUATERNION_TOLERANCE = 0.1
 """Largest deviation of the norm of a quaternion from 1: files have few digits."""
 
@@ -186,7 +189,8 @@ def _parse(rows: Rows, tag: str) -> _Block:
     dtype = [("tag", "S16"), ("ids", np.int64, (line.ids,)), ("numbers", float, (size + entries,))]
     table = rows.parse(dtype, f"{tag}, {line.expected()}", delimiter=None)
     ids, numbers = table["ids"], table["numbers"]
-    _check_numbers(rows, numbers)
+    _check_numbers(rows, numbers[:, :size], _LARGEST_POSE)
+    _check_numbers(rows, numbers[:, size:], _LARGEST_INFORMATION)
     k = 3 * (line.dimension - 1)
     information = np.tile(np.eye(k), (len(ids) if line.ids == 2 else 0, 1, 1))
     if entries:
@@ -244,15 +248,15 @@ def _joined(blocks: list[_Block]) -> tuple[Rows, IntArray, Poses, FloatArray]:
     )
 
 
-def _check_numbers(rows: Rows, numbers: FloatArray) -> None:
-    """Check that all numbers are finite.
+def _check_numbers(rows: Rows, numbers: FloatArray, largest: float) -> None:
+    """Check that all numbers are finite, and not beyond a magnitude.
 
     Raises:
         DataError: naming the first line where one is not.
     """
-    bad = np.flatnonzero(~np.isfinite(numbers).all(axis=1))
+    bad = np.flatnonzero(~(np.abs(numbers) <= largest).all(axis=1))
     if len(bad):
-        raise DataError(f"{rows.where(bad[0])}: a number is not finite")
+        raise DataError(f"{rows.where(bad[0])}: a number is not finite, or too large")
 
 
 def _first_of_each_id(rows: Rows, ids: IntArray, diagnostics: Diagnostics) -> IntArray:

@@ -14,7 +14,7 @@ from slam_graph import maps
 from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.errors import DataError
 from slam_graph.files import Files
-from slam_graph.results.result_files import find_map, refuse_to_replace
+from slam_graph.results.result_files import LARGEST, find_map, refuse_to_replace
 
 if TYPE_CHECKING:
     from slam_graph.maps import SlamMap
@@ -116,6 +116,8 @@ def write_ply(path: Path, points: FloatArray, centres: FloatArray | None = None)
 def read_ply(path: Path | str) -> FloatArray:
     """Read the points (N, 3) of a point cloud that `write_ply` wrote without cameras.
 
+    Points that are not finite, or farther away than any, are left out.
+
     Raises:
         DataError: if the file is missing or has another form.
     """
@@ -130,7 +132,8 @@ def read_ply(path: Path | str) -> FloatArray:
     whole = f"element vertex {len(body) // 24}" in lines and len(body) % 24 == 0
     if not separator or not binary or properties != _POSITION_PROPERTIES or not whole:
         raise DataError(f"{path}: not a point cloud of x, y, z as slam-graph writes it")
-    return np.frombuffer(body, "<f8").reshape(-1, 3).astype(np.float64)
+    points = np.frombuffer(body, "<f8").reshape(-1, 3).astype(np.float64)
+    return np.asarray(points[(np.abs(points) <= LARGEST).all(axis=1)])
 
 
 def save_map(content: SlamMap, path: Path | str, force: bool = False) -> None:

@@ -235,11 +235,17 @@ def state_lines(history: StateHistory) -> Iterator[str]:
         yield ",".join([str(stamp_ns), *cells]) + "\n"
 
 
+LARGEST = 1e18
+"""Numbers of a result are no larger: their squares fit into numbers of 32 bits."""
+_LARGEST_NS = 2**62
+"""Times are no larger, so that their differences fit."""
+
+
 def read_states(path: Path) -> tuple[IntArray, dict[str, FloatArray]]:
     """Read what `state_lines` wrote; the columns may be in any order.
 
     Returns:
-        Times (N,) in ns, and the other columns (N,) by name, NaN where empty.
+        Times (N,) in ns, and the other columns (N,) by name, as in `read_table`.
 
     Raises:
         DataError: if the file is missing or another table.
@@ -258,7 +264,7 @@ def read_table(path: Path, columns: Iterable[str], what: str) -> dict[str, Any]:
 
     Returns:
         Columns (N,) by their titles: those that end with `_ns` are int64, the others float64, NaN
-        where empty.
+        where empty, infinite or beyond any result.
 
     Raises:
         DataError: if the file is missing, or another table.
@@ -273,9 +279,7 @@ def read_table(path: Path, columns: Iterable[str], what: str) -> dict[str, Any]:
             raise ValueError("a row has not as many cells as there are titles")
         cells = list(zip(*rows, strict=True)) or [()] * len(titles)
         return {
-            title: np.array([int(cell) for cell in column], np.int64)
-            if title.endswith("_ns")
-            else np.array([float(cell or "nan") for cell in column], np.float64)
+            title: _times_ns(column) if title.endswith("_ns") else _numbers(column)
             for title, column in zip(titles, cells, strict=True)
         }
     except OSError as error:
@@ -283,6 +287,29 @@ def read_table(path: Path, columns: Iterable[str], what: str) -> dict[str, Any]:
     except (ValueError, OverflowError, csv.Error) as error:
         reason = "it is empty" if path.stat().st_size == 0 else error
         raise DataError(f"{path}: not {what} ({reason})") from error
+
+
+def _times_ns(cells: Iterable[str]) -> IntArray:
+    """A column of times.
+
+    Raises:
+        ValueError: if a cell is none.
+    """
+    times = [int(cell) for cell in cells]
+    if any(abs(time) >= _LARGEST_NS for time in times):
+        raise ValueError("a time does not fit into 62 bits")
+    return np.array(times, np.int64)
+
+
+def _numbers(cells: Iterable[str]) -> FloatArray:
+    """A column of numbers.
+
+    Raises:
+        ValueError: if a cell is none.
+    """
+    values = np.array([float(cell or "nan") for cell in cells], np.float64)
+    values[np.abs(values) > LARGEST] = np.nan
+    return values
 
 
 def read_tum(path: Path) -> Trajectory:

@@ -295,11 +295,10 @@ def _title(metrics: Mapping[str, Any]) -> str:
         IN_MAP: ((metrics["localization"] or {}).get("accuracy"), "yaw"),
     }
     errors = [
-        f"{name} {table[alignment]['ate']['translation_m']['rmse']:.3f} m, "
-        f"{table[alignment]['ate']['rotation_deg']['rmse']:.2f}°"
+        f"{name} {ate['translation_m']['rmse']:.3f} m, {ate['rotation_deg']['rmse']:.2f}°"
         + (" (aligned)" if alignment != mode else "")
         for name, (table, alignment) in tables.items()
-        if table and "ate" in table[alignment]
+        if (ate := ((table or {}).get(alignment) or {}).get("ate")) is not None
     ]
     if errors:
         how = ALIGNED_IN[mode]

@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
@@ -29,14 +28,11 @@ from slam_graph.results.run_picture import (
     with_path_in_map,
 )
 from slam_graph.results.run_summary import RunSummary
+from slam_graph.results.saved_metrics import fault_of_metrics, read_metrics
 from slam_graph.sensors import Rig
 
 if TYPE_CHECKING:
     from slam_graph.maps import SlamMap
-
-_METRICS = ("dataset", "algorithm", "status", "message", "extent", "accuracy")
-_EXTENT = ("start_ns", "frames", "estimated_frames", "coverage")
-"""Keys of `metrics.json` that every version wrote."""
 
 
 def load_result(folder: Path | str) -> SavedRun:
@@ -71,6 +67,8 @@ class SavedRun(RunSummary):
         folder: with the files.
     """
 
+    fault_of_metrics = staticmethod(fault_of_metrics)
+
     def __init__(self, folder: Path | str) -> None:
         self.folder = Path(folder)
 
@@ -85,21 +83,7 @@ class SavedRun(RunSummary):
     @cached_property
     def metrics(self) -> dict[str, Any]:
         """The content of `metrics.json`."""
-        path = self.folder / names.METRICS
-        try:
-            table: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-        except OSError as error:
-            raise DataError(f"{path}: cannot be read ({error.strerror})") from error
-        except ValueError as error:
-            raise DataError(f"{path}: not JSON ({error})") from error
-        try:
-            missing = [key for key in _METRICS if key not in table]
-            missing += [f"extent.{key}" for key in _EXTENT if key not in table["extent"]]
-        except (TypeError, KeyError):
-            missing = ["extent"]
-        if missing:
-            raise DataError(f"{path}: not the metrics of a run (no '{missing[0]}')")
-        return table
+        return read_metrics(self.folder / names.METRICS)
 
     @property
     def status(self) -> str:
@@ -135,17 +119,20 @@ class SavedRun(RunSummary):
         """The poses of a file with the velocities and biases of a file of states.
 
         Raises:
-            DataError: if the two are not of the same times.
+            DataError: if the two are not of the same times, or a state is not finite.
         """
         poses = names.read_tum(self.folder / path)
         stamps, states = names.read_states(self.folder / file)
         if not np.array_equal(stamps, poses.stamps_ns):
             raise DataError(f"{self.folder}: {file} and {path} differ in time")
+        parts = [
+            _columns(states, part) for part in (names.VELOCITY, names.ACCEL_BIAS, names.GYRO_BIAS)
+        ]
+        if not np.isfinite(parts).all():
+            raise DataError(f"{self.folder / file}: a velocity or bias is not a finite number")
+        velocities, accel_biases, gyro_biases = parts
         return replace(
-            poses,
-            velocities=_columns(states, names.VELOCITY),
-            accel_biases=_columns(states, names.ACCEL_BIAS),
-            gyro_biases=_columns(states, names.GYRO_BIAS),
+            poses, velocities=velocities, accel_biases=accel_biases, gyro_biases=gyro_biases
         )
 
     @property

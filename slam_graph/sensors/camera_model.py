@@ -141,11 +141,12 @@ class CameraModel(ABC):
         self, q: FloatArray, coefficients: Coefficients, m: FloatArray, steps: int
     ) -> FloatArray:
         """Newton's method on `distort` from a start m (N, 2)."""
-        for _ in range(steps):
-            value, jacobian = self.distort(m, coefficients)
-            m = m + _solve_2x2(jacobian, q - value)
-            if np.max(np.abs(q - value), initial=0.0) < NEWTON_TOLERANCE:
-                break
+        with np.errstate(all="ignore"):  # of pixels that no point is seen at
+            for _ in range(steps):
+                value, jacobian = self.distort(m, coefficients)
+                m = m + _solve_2x2(jacobian, q - value)
+                if np.max(np.abs(q - value), initial=0.0) < NEWTON_TOLERANCE:
+                    break
         return m
 
 

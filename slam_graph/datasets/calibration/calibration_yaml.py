@@ -19,6 +19,9 @@ from slam_graph.settings import ConfigTree
 ROTATION_TOLERANCE = 1e-3
 """Largest element of R Rᵀ - I for which R counts as a rotation; files may have four digits only."""
 
+FARTHEST_M = 1e9
+"""Largest coordinate of a pose in a file, m; the Earth has 6.4e6."""
+
 MAX_OFFSET_S = 1e8
 """Largest offset between clocks, s: three years, as of a clock that was never set."""
 
@@ -77,6 +80,13 @@ class YamlValue:
             raise DataError(f"{self.where}: '{self.text()[:60]}' is not a number") from None
         if not np.isfinite(value):
             raise DataError(f"{self.where}: '{self.text()[:60]}' is not a finite number")
+        return value
+
+    def positive(self) -> float:
+        """A number above 0 whose square is one too, such as a standard deviation."""
+        value = self.number()
+        if not (value > 0.0 and 0.0 < value * value < np.inf):
+            raise DataError(f"{self.where}: '{self.text()[:60]}' is not a usable number above 0")
         return value
 
     def seconds(self) -> float:
@@ -153,7 +163,8 @@ def pose_from_matrix(matrix: FloatArray, where: str) -> gtsam.Pose3:
         where: what the matrix is and where it stands (file, line), for the error message.
 
     Raises:
-        DataError: if the matrix is not 4x4, not finite, or its rotation part is not a rotation.
+        DataError: if the matrix is not 4x4, not finite, its rotation part is not a rotation, or
+            its translation is beyond `FARTHEST_M`.
     """
     matrix = np.asarray(matrix, dtype=np.float64)
     if matrix.shape != (4, 4) or not np.all(np.isfinite(matrix)):
@@ -165,6 +176,8 @@ def pose_from_matrix(matrix: FloatArray, where: str) -> gtsam.Pose3:
             f"{where}: the upper left 3x3 block is not a rotation "
             f"(|R Rᵀ - I| = {defects[0]:.2g}, det = {dets[0]:.3g})"
         )
+    if not np.abs(matrix[:3, 3]).max() <= FARTHEST_M:
+        raise DataError(f"{where}: a translation of more than {FARTHEST_M:g} m")
     return gtsam.Pose3(gtsam.Rot3.ClosestTo(R), matrix[:3, 3])
 
 

@@ -17,6 +17,9 @@ from slam_graph.datasets.calibration.euroc_calibration import camera_entry, read
 from slam_graph.errors import DataError
 from slam_graph.sensors import DepthSensor
 
+_LARGEST = 1e9
+"""Depth in m, its noise, and units to a metre are no larger."""
+
 
 def read_depth_sensor(entry: YamlValue, cameras: int) -> DepthSensor:
     """A depth sensor from a mapping.
@@ -38,15 +41,17 @@ def read_depth_sensor(entry: YamlValue, cameras: int) -> DepthSensor:
     camera = default.camera if number is None else int(number.number())
     if number is not None and not (camera == number.number() and 0 <= camera < cameras):
         raise DataError(f"{number.where}: expected the number of a camera, 0 to {cameras - 1}")
-    units = default.scale if scale is None else _positive(scale, scale.number())
+    units = default.scale if scale is None else scale.positive()
+    if scale is not None and not 1.0 / _LARGEST <= units <= _LARGEST:
+        raise DataError(f"{scale.where}: {units:g} units to a metre are those of no sensor")
     limits, noise = entry.get("range_m"), entry.get("noise")
     least, most = (default.min_m, default.max_m) if limits is None else limits.numbers(2)
-    if limits is not None and not 0.0 <= least < most:
+    if limits is not None and not 0.0 <= least < most <= _LARGEST:
         raise DataError(f"{limits.where}: expected the least and the largest depth in m")
     constant, square = default.noise_constant_m, default.noise_square_per_m
     if noise is not None:
         constant, square = noise.numbers(2)
-        if min(constant, square) < 0.0 or max(constant, square) == 0.0:
+        if min(constant, square) < 0.0 or not 0.0 < max(constant, square) <= _LARGEST:
             raise DataError(f"{noise.where}: expected the noise in m and its growth in 1/m")
     has_lens = entry.get("camera_model") is not None
     mounting = entry.get("T_cam_depth")
@@ -81,9 +86,3 @@ def depth_entry(sensor: DepthSensor) -> dict[str, Any]:
         "distortion_coeffs": entry.coefficients,
         "resolution": [int(sensor.lens.width), int(sensor.lens.height)],
     }
-
-
-def _positive(value: YamlValue, number: float) -> float:
-    if number <= 0.0:
-        raise DataError(f"{value.where}: expected a number above 0")
-    return number

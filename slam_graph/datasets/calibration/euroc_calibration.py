@@ -18,6 +18,11 @@ from slam_graph.sensors import CAMERA_MODELS, Camera, CameraModel, ImuNoise, Rig
 MAX_READOUT_S = 0.1
 """Longest readout of a rolling shutter that a calibration may give."""
 
+_LARGEST_SIZE = 65535
+"""Width and height of images, pixels."""
+_LARGEST_NUMBER, _SHORTEST_FOCAL_PX = 1e6, 1e-3
+"""Bounds on focal lengths, principal points and coefficients of lenses; lenses keep far off."""
+
 _SAME_READOUT = 0.01
 """Largest relative difference of `readout_time` from `line_delay` times the height."""
 
@@ -36,13 +41,19 @@ def read_camera(entry: YamlValue) -> Camera:
     model, distorted = _read_model(entry)
     intrinsics = entry.require("intrinsics")
     *leading, fx, fy, cx, cy = intrinsics.numbers(4 + model.leading)
-    width, height = entry.require("resolution").numbers(2)
+    size = entry.require("resolution")
+    width, height = size.numbers(2)
+    if not all(0 < value <= _LARGEST_SIZE and value == int(value) for value in (width, height)):
+        raise DataError(f"{size.where}: expected width and height in pixels, two whole numbers")
     count = len(model.coefficient_names) - model.leading
     others = [0.0] * count
     if distorted and count:
         values = entry.require("distortion_coefficients", "distortion_coeffs")
         others = values.numbers(count)
     coefficients = (*leading, *others)
+    numbers = (fx, fy, cx, cy, *coefficients)
+    if max(map(abs, numbers)) > _LARGEST_NUMBER or 0.0 < min(fx, fy) < _SHORTEST_FOCAL_PX:
+        raise DataError(f"{intrinsics.where}: no lens has numbers as large, or as small, as these")
     try:
         model.check(coefficients)
         return Camera(fx, fy, cx, cy, model.name, coefficients, int(width), int(height))
@@ -170,13 +181,17 @@ def shutter_entry(mounted: RigCamera) -> dict[str, Any]:
 
 
 def read_imu_noise(entry: YamlValue) -> ImuNoise:
-    """IMU noise from a mapping with the keys that EuRoC and Kalibr share."""
+    """IMU noise from a mapping with the keys that EuRoC and Kalibr share.
+
+    Raises:
+        DataError: naming file and line of what is missing or not above 0.
+    """
     return ImuNoise(
-        gyro_noise_density=entry.require("gyroscope_noise_density").number(),
-        gyro_random_walk=entry.require("gyroscope_random_walk").number(),
-        accel_noise_density=entry.require("accelerometer_noise_density").number(),
-        accel_random_walk=entry.require("accelerometer_random_walk").number(),
-        rate_hz=entry.require("rate_hz", "update_rate").number(),
+        gyro_noise_density=entry.require("gyroscope_noise_density").positive(),
+        gyro_random_walk=entry.require("gyroscope_random_walk").positive(),
+        accel_noise_density=entry.require("accelerometer_noise_density").positive(),
+        accel_random_walk=entry.require("accelerometer_random_walk").positive(),
+        rate_hz=entry.require("rate_hz", "update_rate").positive(),
     )
 
 
@@ -214,7 +229,7 @@ def read_euroc_rig(mav0: str | Path, cameras: Iterable[str], imu: str = "imu0") 
         camera = RigCamera(
             read_camera(entry),
             platform_T_imu.between(platform_T_camera),
-            0.0 if shift is None else shift.number(),
+            0.0 if shift is None else shift.seconds(),
             name,
         )
         mounted.append(with_shutter(camera, entry))

@@ -95,7 +95,7 @@ def _chain_cameras(chain: YamlValue, needs_imu: bool = True) -> tuple[RigCamera,
     entries = {
         int(found[1]): value
         for name, value in chain.items()
-        if (found := re.fullmatch(r"cam(\d+)", name))
+        if (found := re.fullmatch(r"cam(\d{1,9})", name))
     }
     if not entries:
         raise DataError(

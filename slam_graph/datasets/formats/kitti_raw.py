@@ -179,6 +179,8 @@ GREY = ("00", "01")
 STEREO_TOLERANCE_S = 0.02
 """The cameras are triggered together, 10 times a second; their stamps are the computer's."""
 
+_LEAST_HZ = 0.1
+"""Rate of the IMU where its samples do not show one."""
 _SLOW_IMU_HZ = 50.0
 
 NOISE = {
@@ -223,7 +225,7 @@ class KittiRawSequence(ImageSequence):
             if (self.path / f"image_{camera}").is_dir()
         ]
         day = self.path.parent
-        noise = ImuNoise(**NOISE, rate_hz=self._oxts.rate_hz)
+        noise = ImuNoise(**NOISE, rate_hz=max(self._oxts.rate_hz, _LEAST_HZ))
         chain = options.calibration
         if chain is not None:
             rig = read_kalibr(chain, fallback=noise)

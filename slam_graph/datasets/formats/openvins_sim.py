@@ -80,11 +80,11 @@ def _read_rig(path: Path) -> Rig:
         raise DataError(f"{path}: no cameras in this file")
     imu = content.require("imu")
     noise = ImuNoise(
-        gyro_noise_density=imu.require("gyro_noise_density").number(),
-        gyro_random_walk=imu.require("gyro_random_walk").number(),
-        accel_noise_density=imu.require("accel_noise_density").number(),
-        accel_random_walk=imu.require("accel_random_walk").number(),
-        rate_hz=imu.require("rate_hz").number(),
+        gyro_noise_density=imu.require("gyro_noise_density").positive(),
+        gyro_random_walk=imu.require("gyro_random_walk").positive(),
+        accel_noise_density=imu.require("accel_noise_density").positive(),
+        accel_random_walk=imu.require("accel_random_walk").positive(),
+        rate_hz=imu.require("rate_hz").positive(),
     )
     return Rig(tuple(cameras), noise)
 

@@ -52,7 +52,7 @@ from slam_graph.datasets.sequence import (
     RecordedSequence,
     SequenceInfo,
 )
-from slam_graph.datasets.streams.csv_rows import LARGEST_STAMP_NS
+from slam_graph.datasets.streams.csv_rows import LARGEST_STAMP_NS, measurable
 from slam_graph.datasets.streams.imu_stream import clean_blocks
 from slam_graph.datasets.streams.mask_images import MASKS, MaskFolder, read_classes
 from slam_graph.errors import DataError
@@ -260,8 +260,8 @@ class TrackRecordingSequence(RecordedSequence):
             normalized = self.rig.cameras[camera].camera.undistort(pixels)
         else:
             normalized = np.ascontiguousarray(rows["normalized"])
-        if not (np.isfinite(pixels).all() and np.isfinite(normalized).all()):
-            raise DataError(f"{self.path / name}: a feature is not finite; {AGAIN}")
+        if not (measurable(pixels).all() and measurable(normalized).all()):
+            raise DataError(f"{self.path / name}: a feature is not finite, or too far; {AGAIN}")
         return FeatureObservations(ids, pixels, normalized)
 
     def _with_depth(self, seen: FeatureObservations, data: bytes) -> FeatureObservations:

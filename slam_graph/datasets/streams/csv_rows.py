@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from slam_graph.arrays import BoolArray, FloatArray
 from slam_graph.errors import DataError
 
 _ROWS_PER_BLOCK = 1024
@@ -25,6 +26,9 @@ STAMP_TEXT = "S40"
 
 LARGEST_STAMP_NS = 2**62
 """Times from here on, the year 2116, are faults of a file; so differences of times fit, too."""
+
+_LARGEST = 1e18
+"""Numbers of files are no larger: their squares fit into floating-point numbers of 32 bits."""
 
 _DIGITS = frozenset("0123456789")
 
@@ -175,6 +179,23 @@ def stamps_from_seconds(rows: Rows, texts: NDArray[np.bytes_]) -> NDArray[np.int
     )
     stamps = [stamp_from_seconds(texts[k], rows, int(k)) for k in first]
     return np.repeat(np.array(stamps, np.int64), np.diff(first, append=len(texts)))
+
+
+def refuse_wild_stamps(rows: Rows, stamps_ns: NDArray[np.int64]) -> None:
+    """Refuse stamps (N,) of `rows` whose differences do not fit into 64 bits.
+
+    Raises:
+        DataError: naming the line of the first.
+    """
+    wild = np.flatnonzero((stamps_ns <= -LARGEST_STAMP_NS) | (stamps_ns >= LARGEST_STAMP_NS))
+    if len(wild):
+        stamp = stamps_ns[wild[0]]
+        raise DataError(f"{rows.where(int(wild[0]))}: '{stamp}' is not a time in nanoseconds")
+
+
+def measurable(values: FloatArray) -> BoolArray:
+    """Which values are finite, and not beyond any measurement."""
+    return np.asarray(np.abs(values) <= _LARGEST)
 
 
 def require_rows(path: Path) -> None:

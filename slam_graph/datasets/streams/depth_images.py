@@ -37,6 +37,8 @@ DepthProcess = Callable[[NDArray[Any]], NDArray[Any]]
 _REACH = 0.7
 """A registered point fills the pixels up to this share of a depth pixel's width around it: half,
 and some more, as points on a slanted surface are farther apart."""
+_MOST_FINER = 16.0
+"""A camera resolves no more times as finely as the depth sensor; the cost grows with its square."""
 
 
 class DepthStream(Protocol):
@@ -158,7 +160,13 @@ class Registration:
         self._rays: FloatArray = rays @ camera_T_depth.rotation().matrix().T
         self._origin = np.asarray(camera_T_depth.translation())
         self._camera = camera
-        self._reach = _REACH * max(camera.fx / lens.fx, camera.fy / lens.fy, 1.0)
+        ratio = max(camera.fx / lens.fx, camera.fy / lens.fy, 1.0)
+        if ratio > _MOST_FINER:
+            raise DataError(
+                f"calibration of the depth sensor: its focal length is {ratio:.0f} times shorter "
+                "than that of its camera; correct its intrinsics"
+            )
+        self._reach = _REACH * ratio
 
     def register(self, depth: Metres) -> Metres:
         """The depth image of the camera, NaN where nothing is seen.

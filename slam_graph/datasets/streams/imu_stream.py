@@ -14,7 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam_graph.arrays import IntArray
-from slam_graph.datasets.streams.csv_rows import Rows, count_rows, read_rows, require_rows
+from slam_graph.datasets.streams.csv_rows import (
+    Rows,
+    count_rows,
+    read_rows,
+    refuse_wild_stamps,
+    require_rows,
+)
 from slam_graph.datasets.streams.imu_outliers import without_outliers
 from slam_graph.datasets.streams.pairing import in_order
 from slam_graph.diagnostics import Diagnostics
@@ -201,4 +207,5 @@ class ImuFile:
 def parse_imu_rows(rows: Rows) -> ImuData:
     """Samples of rows (stamp in ns, gyro xyz in rad/s, accel xyz in m/s²): EuRoC's order."""
     table = rows.parse(INTEGER_STAMPS, "stamp [ns], gyro xyz, accel xyz")
+    refuse_wild_stamps(rows, table["stamp"])
     return ImuData(table["stamp"], table["gyro"], table["accel"])

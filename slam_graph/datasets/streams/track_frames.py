@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam_graph.datasets.sequence import FrameStream
+from slam_graph.datasets.streams.csv_rows import measurable
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.sensors import FeatureFrame, FeatureObservations
 
@@ -98,7 +99,7 @@ def _observations(
 ) -> FeatureObservations:
     """The observations of one camera in one frame, without unusable ones."""
     rows = table[table["camera"] == camera]
-    finite = np.isfinite(rows["pixel"]).all(axis=1) & np.isfinite(rows["normalized"]).all(axis=1)
+    finite = measurable(rows["pixel"]).all(axis=1) & measurable(rows["normalized"]).all(axis=1)
     for row in rows[~finite]:
         diagnostics.warn(
             "track_not_finite", f"{where}: feature {row['id']} at {row['stamp']} dropped"
