@@ -77,9 +77,12 @@ class _ImuCleaner:
         stamps = stamps_ns[candidates]
 
         def dropped(k: int, latest: int) -> None:
-            kind = "imu_duplicate" if stamps[k] == latest else "imu_out_of_order"
-            sample = f"{where(int(candidates[k]))}: sample at {stamps[k]}"
-            self.diagnostics.warn(kind, f"{sample} dropped, not in the order of time")
+            sample = f"{where(int(candidates[k]))}: sample at {stamps[k]} dropped"
+            if stamps[k] == latest:
+                self.diagnostics.warn("imu_duplicate", f"{sample}, there is one of that time")
+            else:
+                why = "earlier than the one before, or from the future"
+                self.diagnostics.warn("imu_out_of_order", f"{sample}, {why}")
 
         return candidates[in_order(stamps, dropped, self.latest_ns)]
 

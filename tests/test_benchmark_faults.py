@@ -1,0 +1,113 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""What the benchmark of faults says of a run: in words, and in standard deviations."""
+
+import logging
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from benchmarks import documents, faults
+from benchmarks.baseline import updated
+from benchmarks.faults import AT_S, BACK_S, Off, Path3, Survived, in_words, said_by
+from slam_graph.diagnostics import Diagnostics
+from slam_graph.geometry import Similarity, Trajectory
+
+START_NS = 1_403_636_579_763_555_584
+SIGMA_M = 0.02
+AFTER_S = AT_S + BACK_S
+
+
+def flown(shift_sigmas: float = 0.0) -> Path3:
+    """A turning flight with a right covariance, shifted by so many σ from the fault on."""
+    seconds = np.arange(1.0, 17.0, 0.05)
+    positions = np.column_stack([np.cos(seconds), np.sin(2.0 * seconds), 0.1 * seconds])
+    turns = Rotation.from_rotvec(0.3 * positions).as_quat()
+    truth = Trajectory(START_NS + np.round(seconds * 1e9).astype(np.int64), positions, turns)
+    moved = positions + np.outer(seconds >= AT_S, [0.0, shift_sigmas * SIGMA_M, 0.0])
+    variances = np.diag([1e-4] * 3 + [SIGMA_M**2] * 3)
+    covariances = np.broadcast_to(variances, (len(seconds), 6, 6)).copy()
+    return Path3(replace(truth, positions=moved), covariances, truth, START_NS)
+
+
+def survived(path: Path3 | None) -> Survived:
+    """A run in one segment."""
+    return Survived("ok", 0.01, (0.01,), 0.0, path=path)
+
+
+@pytest.mark.parametrize("shift", [0.0, 2.5, 7.0])
+def test_an_error_is_counted_in_sigmas_whatever_yaw_and_position_the_world_has(
+    shift: float,
+) -> None:
+    path = flown(shift)
+    world = Similarity(Rotation.from_euler("z", 1.1).as_matrix(), np.array([3.0, -2.0, 5.0]))
+    turned = replace(path, estimate=world.apply(path.estimate))
+    for seen in (path, turned):
+        assert seen.sigmas(path.truth, AFTER_S) == pytest.approx(shift, abs=1e-6)
+    assert path.sigmas(path.truth, AT_S - 1.0) == pytest.approx(0.0, abs=1e-6)
+    assert np.isnan(path.sigmas(path.truth, 40.0))
+
+
+def test_a_run_is_judged_by_the_run_without_a_fault_where_that_is_off_too() -> None:
+    good, bad = survived(flown(1.0)), survived(flown(8.0))
+    assert Off.after(good, good, 0.0).within
+    assert not Off.after(bad, good, 0.0).within
+    off = Off.after(bad, bad, 0.0)
+    assert (off.error, off.apart) == (pytest.approx(8.0), pytest.approx(0.0, abs=1e-6))
+    assert off.within
+    assert not Off.after(good, bad, 0.0).within, "it is 7 σ from what it would have been"
+    assert not Off.after(survived(None), good, 0.0).within
+    figures = {m.key: m for m in faults.figures_of(bad, good, 0.0)}
+    assert figures["back"].meets_bar is False
+    again = replace(bad, segments_m=(0.01, 0.01), recovered_s=2.0)
+    for later, back in ((again, True), (replace(again, recovered_s=6.0), False)):
+        figures = {m.key: m for m in faults.figures_of(later, good, 0.0)}
+        assert figures["back"].meets_bar is back
+
+
+def test_what_is_said_is_heard_once_a_kind_and_the_log_is_as_before() -> None:
+    logger = logging.getLogger("slam_graph")
+    before = (logger.level, logger.propagate, list(logger.handlers))
+    diagnostics = Diagnostics()
+    with faults._heard() as said:
+        for number in range(7):
+            diagnostics.warn("imu_gap", f"gap {number}")
+        diagnostics.warn("few_features", "3 of 90: too few")
+    assert said == {"imu_gap": "gap 0", "few_features": "3 of 90: too few"}
+    assert (logger.level, logger.propagate, list(logger.handlers)) == before
+
+
+def test_words_have_seconds_for_stamps_and_no_folder() -> None:
+    folder = Path("/somewhere/euroc/MH_01")
+    text = f"{folder}/cam0/a.png: lost at frame {START_NS + 7_210_000_000}: after {START_NS} ns"
+    assert in_words(text, START_NS, folder) == "cam0/a.png: lost at t = 7.2 s: after t = 0.0 s"
+    assert in_words("20 of 194, 2.345 s", START_NS, folder) == "20 of 194, 2.345 s"
+
+
+def test_a_run_tells_what_the_run_without_a_fault_does_not() -> None:
+    clean = replace(survived(None), said={"image_unreadable": "one"})
+    run = replace(
+        clean, said={**clean.said, "imu_gap": "a", "few": "b"}, counts={"imu_gap": 12, "few": 1}
+    )
+    assert said_by(clean, clean) == ""
+    assert said_by(run, clean) == "`imu_gap` (12 ×): a; `few`: b"
+    assert said_by(replace(run, message="lost"), clean).endswith("`few`: b; lost")
+
+
+def test_each_fault_has_a_line_with_what_was_said() -> None:
+    clean, run = survived(flown(1.0)), replace(survived(flown(2.0)), said={"few": "a | b"})
+    keys = {f"x.{faults.fault_key(name)}.{documents.TOLD}": name for name in ("one", "two, 3 s")}
+    metrics = [m.under(key) for key in keys for m in faults.figures_of(run, clean, 0.0)]
+    metrics.append(replace(metrics[3], key=f"x.none.{documents.TOLD}.error", value=0.01))
+    texts = {f"{key}.{part}": t for key in keys for part, t in (("status", "ok"), ("said", ""))}
+    texts[f"{next(iter(keys))}.said"] = said_by(run, clean)
+    baseline = updated({}, metrics, {"x"}, texts)
+    rows = list(documents._told(documents.Figures(baseline), "x", keys.values()))[2:]
+    assert [row.split(" | ")[0] for row in rows] == ["| one", "| two, 3 s"]
+    assert r"`few`: a \| b" in rows[0]
+    assert "nothing" in rows[1]
+    assert "10.0 → 10.0" in rows[0]
+    assert "2.0 σ" in rows[0]
