@@ -226,7 +226,8 @@ def _heard() -> Iterator[dict[str, str]]:
     class _Listener(logging.Handler):
         def emit(self, record: logging.LogRecord) -> None:
             kind, _, text = record.getMessage().partition(": ")
-            said.setdefault(kind, text)
+            if record.levelno == logging.WARNING and _KIND.fullmatch(kind):
+                said.setdefault(kind, text)
 
     listener, before = _Listener(logging.WARNING), (_LOGGER.level, _LOGGER.propagate)
     _LOGGER.setLevel(logging.WARNING)
@@ -240,6 +241,7 @@ def _heard() -> Iterator[dict[str, str]]:
         _LOGGER.propagate = before[1]
 
 
+_KIND = re.compile("[a-z_]+")
 _STAMP = re.compile(r"(?:frame )?\b(\d{16,})\b(?: ns)?")
 
 

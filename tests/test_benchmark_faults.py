@@ -76,6 +76,8 @@ def test_what_is_said_is_heard_once_a_kind_and_the_log_is_as_before() -> None:
         for number in range(7):
             diagnostics.warn("imu_gap", f"gap {number}")
         diagnostics.warn("few_features", "3 of 90: too few")
+        logger.warning("compiling kernels: once")
+        logger.error("lost: that is the message of the run")
     assert said == {"imu_gap": "gap 0", "few_features": "3 of 90: too few"}
     assert (logger.level, logger.propagate, list(logger.handlers)) == before
 

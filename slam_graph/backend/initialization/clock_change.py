@@ -35,7 +35,7 @@ class ClockChange:
         """What has happened."""
         later = "later" if self.shift_s > 0.0 else "earlier"
         return (
-            f"the clock of the IMU is {1e3 * abs(self.shift_s):.1f} ± {1e3 * self.sigma_s:.1f} ms "
+            f"the clock of the IMU is {1e3 * abs(self.shift_s):.2f} ± {1e3 * self.sigma_s:.2f} ms "
             f"{later} against the cameras since {self.since_ns} ns"
         )
 

@@ -61,7 +61,7 @@ class _ImuCleaner:
             wanted = data.stamps_ns >= self.after_ns
         finite = np.isfinite(data.gyro).all(axis=1) & np.isfinite(data.accel).all(axis=1)
         for k in np.flatnonzero(wanted & ~finite):
-            self.diagnostics.warn("imu_not_finite", f"{where(int(k))}: sample dropped")
+            self.diagnostics.warn("imu_not_finite", f"{where(int(k))}: dropped, not finite")
         candidates = np.flatnonzero(wanted & finite)
         kept = self._in_order(data.stamps_ns, candidates, where)
         self._report_gaps(data.stamps_ns[kept], lambda k: where(int(kept[k])))
