@@ -242,7 +242,7 @@ def _heard() -> Iterator[dict[str, str]]:
 
 
 _KIND = re.compile("[a-z_]+")
-_STAMP = re.compile(r"(?:frame )?\b(\d{16,})\b(?: ns)?")
+_STAMP = re.compile(r"(?:frame )?(?<![\w/])(\d{16,})\b(?: ns)?")
 
 
 def in_words(text: str, start_ns: int, recording: Path) -> str:

@@ -131,6 +131,14 @@ def test_the_imu_is_cleaned_as_by_a_reader(tracks: RecordedSequence, name: str, 
     assert np.all(np.diff(imu.stamps_ns) > 0)
 
 
+def test_a_camera_without_images_is_counted_as_by_a_reader(images: RecordedSequence) -> None:
+    faulty = inject(images, [f"camera_lost:at_s={AT_S},camera=1"])
+    before = faulty.diagnostics.counts["camera_frame_missing"]
+    missing = sum(image is None for frame in faulty.frames() for image in frame.images)
+    assert missing > 0
+    assert faulty.diagnostics.counts["camera_frame_missing"] - before == missing
+
+
 def test_being_kidnapped_takes_time_out_of_everything(tracks: RecordedSequence) -> None:
     """Frames, IMU and truth go on without a gap in time, from another place."""
     faulty = inject(tracks, [f"kidnapped:at_s=2,duration_s={FOR_S}"])

@@ -30,7 +30,7 @@ def counted(rig: Rig, frames: list[CameraFrame] | list[FeatureFrame]) -> Counter
 
 
 def images(count: int, without: set[int] = frozenset(), held: set[int] = frozenset()) -> list:
-    """Frames of two cameras, some of them left out, some with the second image of the one before."""
+    """Frames of two cameras, some left out, some with the second image of the one before."""
     rng, frames, last = np.random.default_rng(0), [], None
     for k in range(count):
         first, second = rng.integers(0, 256, (2, 60, 80), np.uint8)
