@@ -314,10 +314,8 @@ def _back(figures: Figures, run: str) -> str:
     if figures(f"{run}.segments", 0) != "1":
         text = f"new segment, {figures(f'{run}.recovered_in', 1)} s"
     else:
-        error, clean, apart = (
-            figures(f"{run}.{key}", 1) for key in ("sigmas", "sigmas_clean", "sigmas_apart")
-        )
-        text = f"{error} σ; {clean} without; {apart} apart"
+        error, clean = (figures(f"{run}.{key}", 1) for key in ("sigmas", "sigmas_clean"))
+        text = f"{error} σ; {clean} without"
     return text if figures(f"{run}.back", 0) == "1" else f"**no:** {text}"
 
 

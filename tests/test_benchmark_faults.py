@@ -42,29 +42,43 @@ def survived(path: Path3 | None) -> Survived:
 def test_an_error_is_counted_in_sigmas_whatever_yaw_and_position_the_world_has(
     shift: float,
 ) -> None:
-    path = flown(shift)
     world = Similarity(Rotation.from_euler("z", 1.1).as_matrix(), np.array([3.0, -2.0, 5.0]))
-    turned = replace(path, estimate=world.apply(path.estimate))
-    for seen in (path, turned):
-        assert seen.sigmas(path.truth, AFTER_S) == pytest.approx(shift, abs=1e-6)
-    assert path.sigmas(path.truth, AT_S - 1.0) == pytest.approx(0.0, abs=1e-6)
-    assert np.isnan(path.sigmas(path.truth, 40.0))
+    for where in (Similarity.identity(), world):
+        clean, path = (
+            survived(replace(p, estimate=where.apply(p.estimate))) for p in (flown(), flown(shift))
+        )
+        off = Off.after(path, clean, 0.0)
+        assert off.error == pytest.approx(shift, abs=1e-6)
+        assert (off.clean, off.factor) == (pytest.approx(0.0, abs=1e-6), 1.0)
+        assert off.within is (shift <= 3.0)
+        assert path.path is not None
+        assert clean.path is not None
+        onto = clean.path.onto_truth()
+        assert path.path.sigmas(onto, AT_S - 1.0) == pytest.approx(0.0, abs=1e-6)
+        assert np.isnan(path.path.sigmas(onto, 40.0))
 
 
-def test_a_run_is_judged_by_the_run_without_a_fault_where_that_is_off_too() -> None:
-    good, bad = survived(flown(1.0)), survived(flown(8.0))
-    assert Off.after(good, good, 0.0).within
-    assert not Off.after(bad, good, 0.0).within
-    off = Off.after(bad, bad, 0.0)
-    assert (off.error, off.apart) == (pytest.approx(8.0), pytest.approx(0.0, abs=1e-6))
+def test_the_bar_grows_with_the_error_that_is_there_without_a_fault() -> None:
+    clean = survived(flown())
+    assert clean.path is not None
+    noise = np.random.default_rng(0).normal(0.0, 2.0 * SIGMA_M, (len(clean.path.estimate), 3))
+    noisy = replace(
+        clean.path,
+        estimate=replace(clean.path.estimate, positions=clean.path.estimate.positions + noise),
+    )
+    off = Off.after(survived(flown(5.0)), survived(noisy), 0.0)
+    assert off.factor == pytest.approx(2.0, rel=0.1)
     assert off.within
-    assert not Off.after(good, bad, 0.0).within, "it is 7 σ from what it would have been"
-    assert not Off.after(survived(None), good, 0.0).within
-    figures = {m.key: m for m in faults.figures_of(bad, good, 0.0)}
-    assert figures["back"].meets_bar is False
+    assert not Off.after(survived(flown(7.0)), survived(noisy), 0.0).within
+    assert not Off.after(survived(None), clean, 0.0).within
+
+
+def test_a_run_is_back_in_one_segment_by_its_error_and_in_a_new_one_in_time() -> None:
+    good, bad = survived(flown(1.0)), survived(flown(60.0))
     again = replace(bad, segments_m=(0.01, 0.01), recovered_s=2.0)
-    for later, back in ((again, True), (replace(again, recovered_s=6.0), False)):
-        figures = {m.key: m for m in faults.figures_of(later, good, 0.0)}
+    cases = ((good, True), (bad, False), (again, True), (replace(again, recovered_s=6.0), False))
+    for run, back in cases:
+        figures = {m.key: m for m in faults.figures_of(run, survived(flown()), 0.0)}
         assert figures["back"].meets_bar is back
 
 
@@ -100,7 +114,7 @@ def test_a_run_tells_what_the_run_without_a_fault_does_not() -> None:
 
 
 def test_each_fault_has_a_line_with_what_was_said() -> None:
-    clean, run = survived(flown(1.0)), replace(survived(flown(2.0)), said={"few": "a | b"})
+    clean, run = survived(flown()), replace(survived(flown(2.0)), said={"few": "a | b"})
     keys = {f"x.{faults.fault_key(name)}.{documents.TOLD}": name for name in ("one", "two, 3 s")}
     metrics = [m.under(key) for key in keys for m in faults.figures_of(run, clean, 0.0)]
     metrics.append(replace(metrics[3], key=f"x.none.{documents.TOLD}.error", value=0.01))
