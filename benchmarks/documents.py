@@ -12,7 +12,7 @@ from typing import TypeVar
 
 from benchmarks.baseline import Baseline, benchmark_of, text_of, value_of
 from benchmarks.faults import ALGORITHMS as FAULTY
-from benchmarks.faults import FAULTS, OF_TRACKS, fault_key
+from benchmarks.faults import FAULTS, OF_TRACKS, SIGMA_BAR, fault_key
 from benchmarks.flights import FLIGHTS, flight_is_held_out
 from benchmarks.kernels import SIZES
 from benchmarks.suite import CORE, PEERS, RECURSIVE
@@ -296,6 +296,8 @@ def _told(figures: Figures, suite: str, struck: Iterable[str]) -> Iterator[str]:
     yield "| fault | status | what is said | error without → with [mm] | back |"
     yield "|---|---|---|---:|---|"
     without_mm = 1e3 * float(figures(f"{suite}.none.{TOLD}.error", 6))
+    bar = SIGMA_BAR * float(figures(f"{suite}.none.{TOLD}.sigma_factor", 3))
+    yield line("none", "", "", f"{without_mm:.1f}", f"bar: {bar:.1f} σ")
     for fault in struck:
         run = f"{suite}.{fault_key(fault)}.{TOLD}"
         with_mm = without_mm * float(figures(f"{run}.segment_ratio", 3))

@@ -257,6 +257,10 @@ def in_words(text: str, start_ns: int, recording: Path) -> str:
     return _STAMP.sub(lambda found: f"t = {(int(found[1]) - start_ns) * 1e-9:.1f} s", text)
 
 
+_CUT = re.compile(r"^IMU sample of t = [-\d.]+ s: (?=.*\bt = )|: gyroscope .*$")
+"""What a table has no room for: a time that is said twice, and the values of a sample."""
+
+
 def said_by(run: Survived, clean: Survived) -> str:
     """What a run with a fault says and the one without does not, in one line of a table."""
     new = [kind for kind in run.said if kind not in clean.said]
@@ -264,7 +268,7 @@ def said_by(run: Survived, clean: Survived) -> str:
     for kind in new:
         count = run.counts.get(kind, 1)
         times = f" ({count} ×)" if count > 1 else ""
-        lines.append(f"`{kind}`{times}: {run.said[kind]}")
+        lines.append(f"`{kind}`{times}: {_CUT.sub('', run.said[kind])}")
     return "; ".join([*lines, *filter(None, [run.message])])
 
 

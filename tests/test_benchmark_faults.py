@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 from benchmarks import documents, faults
 from benchmarks.baseline import updated
 from benchmarks.faults import AT_S, BACK_S, Off, Path3, Survived, in_words, said_by
+from benchmarks.metric import info
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.geometry import Similarity, Trajectory
 
@@ -113,15 +114,32 @@ def test_a_run_tells_what_the_run_without_a_fault_does_not() -> None:
     assert said_by(replace(run, message="lost"), clean).endswith("`few`: b; lost")
 
 
+@pytest.mark.parametrize(
+    ("text", "short"),
+    [
+        ("IMU sample of t = 7.0 s: no sample for 1 s before t = 7.0 s", "no sample for 1 s before"),
+        ("IMU sample of t = 6.0 s: dropped, not finite", "IMU sample of t = 6.0 s: dropped"),
+        ("IMU sample at t = 6.0 s left out, stuck: gyroscope 0, 0, 0 rad/s", "IMU sample at t"),
+    ],
+)
+def test_a_line_of_a_table_says_a_time_once_and_no_values(text: str, short: str) -> None:
+    clean = survived(None)
+    said = said_by(replace(clean, said={"few": text}), clean)
+    assert said.startswith(f"`few`: {short}")
+    assert said.count("t = ") == 1
+    assert "gyroscope" not in said
+
+
 def test_each_fault_has_a_line_with_what_was_said() -> None:
     clean, run = survived(flown()), replace(survived(flown(2.0)), said={"few": "a | b"})
     keys = {f"x.{faults.fault_key(name)}.{documents.TOLD}": name for name in ("one", "two, 3 s")}
     metrics = [m.under(key) for key in keys for m in faults.figures_of(run, clean, 0.0)]
-    metrics.append(replace(metrics[3], key=f"x.none.{documents.TOLD}.error", value=0.01))
+    for figure, value in (("error", 0.01), ("sigma_factor", 1.5)):
+        metrics.append(info(f"x.none.{documents.TOLD}.{figure}", value, ""))
     texts = {f"{key}.{part}": t for key in keys for part, t in (("status", "ok"), ("said", ""))}
     texts[f"{next(iter(keys))}.said"] = said_by(run, clean)
     baseline = updated({}, metrics, {"x"}, texts)
-    rows = list(documents._told(documents.Figures(baseline), "x", keys.values()))[2:]
+    rows = list(documents._told(documents.Figures(baseline), "x", keys.values()))[3:]
     assert [row.split(" | ")[0] for row in rows] == ["| one", "| two, 3 s"]
     assert r"`few`: a \| b" in rows[0]
     assert "nothing" in rows[1]
