@@ -11,9 +11,10 @@ fault at the latest the run is back, in one of two ways:
 - The estimate is within 3 σ: √NEES of its position, which under a right covariance 97 % of the
   states are. Yaw and position are aligned as those of the run without a fault are over its whole
   length: both runs are the same before the fault, and a few seconds of path before it would not
-  show the yaw well enough. Where the run without a fault is off by more than its σ all the way, so
-  may the run with one be: the bar is multiplied by √(its mean NEES / 3). That is 1 on tracks. On
-  MH_01 the truth is some millimetres off, and errors of tracks in images are correlated.
+  show the yaw well enough. Where the run without a fault is beyond 3 σ itself at that time, that
+  tells nothing of the fault: the bar is multiplied by √(its mean NEES / 3), if that is more than 1.
+  It is 1 on tracks. On MH_01 the truth is some millimetres off, and errors of tracks in images are
+  correlated.
 
 What a run says are the warnings that it prints and the run without a fault does not, one of each
 kind, and the message of its end.
@@ -178,7 +179,8 @@ class Off:
     @property
     def within(self) -> bool:
         """Whether the run is within the bar, as the head of this file says."""
-        return self.error <= SIGMA_BAR * self.factor
+        bar = SIGMA_BAR * (self.factor if self.clean > SIGMA_BAR else 1.0)
+        return self.error <= bar
 
     @staticmethod
     def after(run: Survived, clean: Survived, lasts_s: float) -> Off:

@@ -69,7 +69,9 @@ def test_the_bar_grows_with_the_error_that_is_there_without_a_fault() -> None:
     )
     off = Off.after(survived(flown(5.0)), survived(noisy), 0.0)
     assert off.factor == pytest.approx(2.0, rel=0.1)
+    assert off.clean > 3.0
     assert off.within
+    assert not replace(off, clean=2.9).within
     assert not Off.after(survived(flown(7.0)), survived(noisy), 0.0).within
     assert not Off.after(survived(None), clean, 0.0).within
 
