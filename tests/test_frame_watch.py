@@ -75,5 +75,15 @@ def test_repeated_images_and_features_are_counted(rig: Rig) -> None:
     assert counted(rig, tracks(20, held={5, 6})) == {"image_repeated": 2}
 
 
+def test_features_that_are_few_already_say_nothing(rig: Rig) -> None:
+    """Eight of sixteen features go on from frame to frame."""
+    frames = []
+    for k in range(20):
+        pixels = np.arange(32.0).reshape(16, 2) + k
+        seen = FeatureObservations(np.arange(16) + 8 * k, pixels, pixels / 400.0)
+        frames.append(FeatureFrame(k * PERIOD_NS, (seen, seen)))
+    assert not counted(rig, frames)
+
+
 def test_tracks_that_end_all_at_once_are_counted_once(rig: Rig) -> None:
     assert counted(rig, tracks(20, empty={8, 9, 10, 15})) == {"few_features": 2}

@@ -21,8 +21,8 @@ _GAP_PERIODS = 2.5
 """A pause longer than so many of the usual ones: two frames or more are missing."""
 _USUAL, _FEWEST_PAUSES = 31, 10
 """The usual pause is the median of the last so many, once there are so few."""
-_FEW_FEATURES = 15
-"""Recorded tracks have ended if fewer of them go on, as in the front end."""
+_FEW_FEATURES, _FEW_SHARE = 15, 0.25
+"""Recorded tracks have ended all at once if fewer of them go on, and a smaller share."""
 _ROWS_APART = 48
 """Rows of images that are compared first, as nearly all images differ there already."""
 
@@ -72,7 +72,7 @@ class FrameWatch:
             followed = int(np.count_nonzero(np.isin(seen.ids, now.ids)))
             if _repeated(seen, now):
                 self._warn_of_repeat(f"{name} gives the features", frame.stamp_ns)
-            elif followed < _FEW_FEATURES <= len(seen):
+            elif followed < min(_FEW_FEATURES, _FEW_SHARE * len(seen)):
                 what = f"{followed} of {len(seen)} features of {name} go on at {frame.stamp_ns}"
                 self._diagnostics.warn("few_features", what)
 
