@@ -42,6 +42,7 @@ from slam_graph.errors import DataError
 from slam_graph.evaluation import ape, synchronize
 from slam_graph.evaluation.consistency import Nees, nees
 from slam_graph.geometry import Similarity, Trajectory
+from slam_graph.results import RunResult
 
 RECORDING, TRACKS = "euroc/MH_01_easy_17s", "openvins_sim/euroc_V1_01"
 CLIP_S = 17.0
@@ -94,7 +95,7 @@ _LOGGER = logging.getLogger("slam_graph")
 
 
 @dataclass(frozen=True, eq=False)
-class Path3:
+class RunPath:
     """Positions of a run, and how sure it is of them.
 
     Attributes:
@@ -158,7 +159,7 @@ class Survived:
     said: Mapping[str, str] = field(default_factory=dict)
     counts: Mapping[str, int] = field(default_factory=dict)
     message: str = ""
-    path: Path3 | None = None
+    path: RunPath | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -205,12 +206,9 @@ def survive(recording: Path, algorithm: str, fault: str, lasts_s: float) -> Surv
             errors.append(ape(run.truth, part, alignment="yaw").statistics.rmse)
         except DataError:  # too short to be judged
             continue
-    whole, path = float("nan"), None
-    start_ns, truth = result.input.start_ns, result.groundtruth
+    whole, start_ns = float("nan"), result.input.start_ns
     if len(result.history):
         whole = ape(run.truth, result.trajectory, alignment="yaw").statistics.rmse
-        covariances = result.history.pose_covariances()
-        path = None if truth is None else Path3(result.trajectory, covariances, truth, start_ns)
     later = [s.begin_ns for s in result.segments.later]
     end_ns = start_ns + round((AT_S + lasts_s) * 1e9)
     return Survived(
@@ -222,8 +220,16 @@ def survive(recording: Path, algorithm: str, fault: str, lasts_s: float) -> Surv
         said={kind: in_words(text, start_ns, recording) for kind, text in said.items()},
         counts=dict(result.warnings),
         message=in_words(result.message, start_ns, recording),
-        path=path,
+        path=_path_of(result),
     )
+
+
+def _path_of(result: RunResult) -> RunPath | None:
+    """The path of a run with its truth, if it has both."""
+    truth, start_ns = result.groundtruth, result.input.start_ns
+    if truth is None or not len(result.history):
+        return None
+    return RunPath(result.trajectory, result.history.pose_covariances(), truth, start_ns)
 
 
 @contextmanager

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks import documents, faults
 from benchmarks.baseline import updated
-from benchmarks.faults import AT_S, BACK_S, Off, Path3, Survived, in_words, said_by
+from benchmarks.faults import AT_S, BACK_S, Off, RunPath, Survived, in_words, said_by
 from benchmarks.metric import info
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.geometry import Similarity, Trajectory
@@ -22,7 +22,7 @@ SIGMA_M = 0.02
 AFTER_S = AT_S + BACK_S
 
 
-def flown(shift_sigmas: float = 0.0) -> Path3:
+def flown(shift_sigmas: float = 0.0) -> RunPath:
     """A turning flight with a right covariance, shifted by so many σ from the fault on."""
     seconds = np.arange(1.0, 17.0, 0.05)
     positions = np.column_stack([np.cos(seconds), np.sin(2.0 * seconds), 0.1 * seconds])
@@ -31,10 +31,10 @@ def flown(shift_sigmas: float = 0.0) -> Path3:
     moved = positions + np.outer(seconds >= AT_S, [0.0, shift_sigmas * SIGMA_M, 0.0])
     variances = np.diag([1e-4] * 3 + [SIGMA_M**2] * 3)
     covariances = np.broadcast_to(variances, (len(seconds), 6, 6)).copy()
-    return Path3(replace(truth, positions=moved), covariances, truth, START_NS)
+    return RunPath(replace(truth, positions=moved), covariances, truth, START_NS)
 
 
-def survived(path: Path3 | None) -> Survived:
+def survived(path: RunPath | None) -> Survived:
     """A run in one segment."""
     return Survived("ok", 0.01, (0.01,), 0.0, path=path)
 

@@ -63,12 +63,12 @@ class FrameWatch:
         self._pauses_ns.append(pause_ns)
 
     def _look_at_images(self, before: CameraFrame, frame: CameraFrame) -> None:
-        for name, old, new in zip(self._names, before.images, frame.images, strict=True):
+        for name, old, new in zip(self._names, before.images, frame.images, strict=False):
             if old is not None and new is not None and _same(old, new):
                 self._warn_of_repeat(f"{name} gives the image", frame.stamp_ns)
 
     def _look_at_tracks(self, before: FeatureFrame, frame: FeatureFrame) -> None:
-        for name, seen, now in zip(self._names, before.cameras, frame.cameras, strict=True):
+        for name, seen, now in zip(self._names, before.cameras, frame.cameras, strict=False):
             followed = int(np.count_nonzero(np.isin(seen.ids, now.ids)))
             if _repeated(seen, now):
                 self._warn_of_repeat(f"{name} gives the features", frame.stamp_ns)
