@@ -120,6 +120,7 @@ def test_faults_of_files_are_refused_on_tracks(tracks: RecordedSequence) -> None
         ("imu_out_of_order", "imu_out_of_order"),
         ("imu_nan", "imu_not_finite"),
         ("imu_missing", "imu_gap"),
+        ("imu_dropped", "imu_sample_missing"),
     ],
 )
 def test_the_imu_is_cleaned_as_by_a_reader(tracks: RecordedSequence, name: str, kind: str) -> None:
