@@ -337,6 +337,9 @@ def _survived(figures: Figures, run: str) -> str:
     text = f"{figures(f'{run}.segment_ratio', 1)} ×"
     if segments != "1":
         text += f", {segments} segments, {recovered} s"
+    back = f"{run}.back"  # algorithms that were not measured since lack it
+    if figures.has(back) and figures(back, 0) == "0":
+        text += ", **not back**"
     return text if figures(f"{run}.completed", 0) == "1" else f"{text}, not `ok`"
 
 
