@@ -11,7 +11,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Collection, Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -34,10 +34,12 @@ class Record:
     Attributes:
         versions: of the packages that it was measured with; or a note of where it is from.
         metrics: figures by their full key.
+        texts: what runs said, by full keys too.
     """
 
     versions: Mapping[str, str]
     metrics: Mapping[str, Metric]
+    texts: Mapping[str, str] = field(default_factory=dict)
 
 
 Baseline = Mapping[str, Record]
@@ -63,6 +65,7 @@ def read_baseline(path: Path = BASELINE_FILE) -> Baseline:
             name: Record(
                 record["versions"],
                 {key: Metric.from_table(key, row) for key, row in record["figures"].items()},
+                record.get("texts", {}),
             )
             for name, record in table["benchmarks"].items()
         }
@@ -72,18 +75,28 @@ def read_baseline(path: Path = BASELINE_FILE) -> Baseline:
         ) from error
 
 
-def updated(baseline: Baseline, metrics: Iterable[Metric], ran: Collection[str]) -> Baseline:
+def updated(
+    baseline: Baseline,
+    metrics: Iterable[Metric],
+    ran: Collection[str],
+    texts: Mapping[str, str] | None = None,
+) -> Baseline:
     """A baseline with the figures of the benchmarks that ran, and the others as they were.
 
     Args:
         baseline: the earlier records.
         metrics: what was measured.
         ran: names of the benchmarks that ran.
+        texts: what their runs said, by full keys.
     """
     found: dict[str, dict[str, Metric]] = {name: {} for name in ran}
     for metric in metrics:
         found[benchmark_of(metric.key)][metric.key] = metric
-    return {**baseline, **{name: Record(versions(), rows) for name, rows in found.items() if rows}}
+    said: dict[str, dict[str, str]] = {name: {} for name in ran}
+    for key, text in (texts or {}).items():
+        said[benchmark_of(key)][key] = text
+    made = {name: Record(versions(), rows, said[name]) for name, rows in found.items() if rows}
+    return {**baseline, **made}
 
 
 def write_baseline(baseline: Baseline, path: Path = BASELINE_FILE) -> None:
@@ -92,10 +105,12 @@ def write_baseline(baseline: Baseline, path: Path = BASELINE_FILE) -> None:
         name: {
             "versions": dict(record.versions),
             "figures": {key: _rounded(metric) for key, metric in record.metrics.items()},
+            **({"texts": dict(record.texts)} if record.texts else {}),
         }
         for name, record in sorted(baseline.items())
     }
-    text = json.dumps({"schema_version": SCHEMA_VERSION, "benchmarks": benchmarks}, indent=1)
+    table = {"schema_version": SCHEMA_VERSION, "benchmarks": benchmarks}
+    text = json.dumps(table, indent=1)
     path.write_text(_one_line_a_figure(text) + "\n", encoding="utf-8")
 
 
@@ -109,6 +124,12 @@ def value_of(baseline: Baseline, key: str) -> float | None:
     record = baseline.get(benchmark_of(key))
     metric = None if record is None else record.metrics.get(key)
     return None if metric is None else metric.value
+
+
+def text_of(baseline: Baseline, key: str) -> str | None:
+    """What a run said; None if the baseline does not have it."""
+    record = baseline.get(benchmark_of(key))
+    return None if record is None else record.texts.get(key)
 
 
 def complaints(metrics: Iterable[Metric], baseline: Baseline, ran: Collection[str]) -> list[str]:

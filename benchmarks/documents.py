@@ -8,10 +8,11 @@ import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeVar
 
-from benchmarks.baseline import Baseline, benchmark_of, value_of
+from benchmarks.baseline import Baseline, benchmark_of, text_of, value_of
 from benchmarks.faults import ALGORITHMS as FAULTY
-from benchmarks.faults import FAULTS, OF_TRACKS, fault_key
+from benchmarks.faults import FAULTS, OF_TRACKS, SIGMA_BAR, fault_key
 from benchmarks.flights import FLIGHTS, flight_is_held_out
 from benchmarks.kernels import SIZES
 from benchmarks.suite import CORE, PEERS, RECURSIVE
@@ -30,13 +31,16 @@ class Figures:
         Raises:
             DataError: if the baseline does not have it.
         """
-        value = value_of(self.baseline, key)
-        if value is None:
-            raise DataError(
-                f"{key} is not in the baseline; run `python -m benchmarks.run --only "
-                f"{benchmark_of(key)} --update-baseline`"
-            )
+        value = _there(value_of(self.baseline, key), key)
         return f"{value:.{digits}f}" if math.isfinite(value) else "-"
+
+    def text(self, key: str) -> str:
+        """What a run said.
+
+        Raises:
+            DataError: if the baseline does not have it.
+        """
+        return _there(text_of(self.baseline, key), key)
 
     def has(self, key: str) -> bool:
         """Whether the baseline has a figure."""
@@ -45,6 +49,23 @@ class Figures:
     def all(self, keys: Sequence[str], digits: int, separator: str = " / ") -> str:
         """Several figures in one cell."""
         return separator.join(self(key, digits) for key in keys)
+
+
+_Value = TypeVar("_Value")
+
+
+def _there(value: _Value | None, key: str) -> _Value:
+    """A value of the baseline.
+
+    Raises:
+        DataError: if the baseline does not have it.
+    """
+    if value is None:
+        raise DataError(
+            f"{key} is not in the baseline; run `python -m benchmarks.run --only "
+            f"{benchmark_of(key)} --update-baseline`"
+        )
+    return value
 
 
 def results(figures: Figures) -> Iterator[str]:
@@ -260,6 +281,46 @@ def faults_tracks(figures: Figures) -> Iterator[str]:
     yield from _faulty(figures, "faults_tracks", OF_TRACKS)
 
 
+def faults_said(figures: Figures) -> Iterator[str]:
+    """What a run says of each fault in images, and whether it is back after it."""
+    yield from _told(figures, "faults", FAULTS)
+
+
+def faults_tracks_said(figures: Figures) -> Iterator[str]:
+    """The same in tracks."""
+    yield from _told(figures, "faults_tracks", OF_TRACKS)
+
+
+def _told(figures: Figures, suite: str, struck: Iterable[str]) -> Iterator[str]:
+    """A line for each fault, of runs under the default algorithm."""
+    yield "| fault | status | what is said | error without → with [mm] | back |"
+    yield "|---|---|---|---:|---|"
+    without_mm = 1e3 * float(figures(f"{suite}.none.{TOLD}.error", 6))
+    bar = SIGMA_BAR * float(figures(f"{suite}.none.{TOLD}.sigma_factor", 3))
+    yield line("none", "", "", f"{without_mm:.1f}", f"bar: {bar:.1f} σ")
+    for fault in struck:
+        run = f"{suite}.{fault_key(fault)}.{TOLD}"
+        with_mm = without_mm * float(figures(f"{run}.segment_ratio", 3))
+        said = figures.text(f"{run}.said").replace("|", "\\|")
+        errors = f"{without_mm:.1f} → {with_mm:.1f}"
+        status = f"`{figures.text(f'{run}.status')}`"
+        yield line(fault, status, said or "nothing", errors, _back(figures, run))
+
+
+TOLD = "msckf"
+"""The algorithm whose runs are told of line by line."""
+
+
+def _back(figures: Figures, run: str) -> str:
+    """Whether a run is back some time after a fault: in a new segment, or by its σ."""
+    if figures(f"{run}.segments", 0) != "1":
+        text = f"new segment, {figures(f'{run}.recovered_in', 1)} s"
+    else:
+        error, clean = (figures(f"{run}.{key}", 1) for key in ("sigmas", "sigmas_clean"))
+        text = f"{error} σ; {clean} without"
+    return text if figures(f"{run}.back", 0) == "1" else f"**no:** {text}"
+
+
 def _faulty(figures: Figures, suite: str, struck: Iterable[str]) -> Iterator[str]:
     """Runs of a benchmark; algorithms that were not measured yet are left out."""
     names = [name for name in FAULTY if figures.has(f"{suite}.none.{name}.error")]
@@ -276,6 +337,9 @@ def _survived(figures: Figures, run: str) -> str:
     text = f"{figures(f'{run}.segment_ratio', 1)} ×"
     if segments != "1":
         text += f", {segments} segments, {recovered} s"
+    back = f"{run}.back"  # algorithms that were not measured since lack it
+    if figures.has(back) and figures(back, 0) == "0":
+        text += ", **not back**"
     return text if figures(f"{run}.completed", 0) == "1" else f"{text}, not `ok`"
 
 
@@ -305,6 +369,8 @@ TABLES: dict[str, Callable[[Figures], Iterator[str]]] = {
     "peers": peers,
     "kernels": kernels,
     "growth": growth,
+    "faults_said": faults_said,
+    "faults_tracks_said": faults_tracks_said,
     "faults": faults,
     "faults_tracks": faults_tracks,
     "verdict": verdict,

@@ -75,6 +75,15 @@ def measured(results: Results) -> list[Metric]:
     return [metric.under(name) for name, outcome in results.items() for metric in outcome.metrics]
 
 
+def texts(results: Results) -> dict[str, str]:
+    """What runs said, by keys with the names of their benchmarks."""
+    return {
+        f"{name}.{key}": text
+        for name, outcome in results.items()
+        for key, text in outcome.texts.items()
+    }
+
+
 def table(results: Results) -> dict[str, Any]:
     """All that was measured, as JSON can hold it."""
     return {
@@ -85,6 +94,7 @@ def table(results: Results) -> dict[str, Any]:
             name: {
                 "metrics": [metric.under(name).to_table() for metric in outcome.metrics],
                 "notes": remarks(outcome),
+                "texts": texts({name: outcome}),
             }
             for name, outcome in results.items()
         },

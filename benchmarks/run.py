@@ -123,9 +123,8 @@ def write(options: argparse.Namespace, results: report.Results, before: baseline
         )
     if options.update_baseline:
         measured = report.measured(results)
-        baseline.write_baseline(
-            baseline.updated(before, measured, results.keys()), options.baseline
-        )
+        now = baseline.updated(before, measured, results.keys(), report.texts(results))
+        baseline.write_baseline(now, options.baseline)
 
 
 def gate(results: report.Results, before: baseline.Baseline) -> int:

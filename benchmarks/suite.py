@@ -37,11 +37,13 @@ class Outcome:
     Attributes:
         metrics: figures; their keys lack the name of the benchmark.
         notes: lines that a reader should know beside the figures.
+        texts: what a run said, by key as figures have; for tables of the documents, never judged.
         failure: why it could not be measured; empty if it could.
     """
 
     metrics: list[Metric] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
+    texts: dict[str, str] = field(default_factory=dict)
     failure: str = ""
 
     def add(

@@ -56,7 +56,8 @@ def test_a_baseline_is_read_back_and_keeps_what_was_not_run(tmp_path: Path) -> N
         Metric("a.band", 1.0, "", "band", (0.3, 4.0)),
         info("a.shown", 3.0, "m"),
     ]
-    baseline.write_baseline(baseline.updated(before, metrics, {"a", "failed"}), path)
+    said = {"a.new.said": "lost at 3 s × 2, for “no” reason"}
+    baseline.write_baseline(baseline.updated(before, metrics, {"a", "failed"}, said), path)
     found = baseline.read_baseline(path)
     assert {name: list(record.metrics) for name, record in found.items()} == {
         "a": ["a.new", "a.none", "a.band", "a.shown"],
@@ -67,6 +68,11 @@ def test_a_baseline_is_read_back_and_keeps_what_was_not_run(tmp_path: Path) -> N
     assert math.isnan(kept["a.none"].value)
     assert [kept["a.band"], kept["a.shown"]] == metrics[2:]
     assert "gtsam" in found["a"].versions
+    assert found["a"].texts == said
+    assert baseline.text_of(found, "a.new.said") == said["a.new.said"]
+    assert baseline.text_of(found, "b.kept.said") is None
+    spoken = {"a": replace(found["a"], metrics={})}
+    assert baseline.complaints([], spoken, {"a"}) == [], "texts are not judged"
 
 
 @pytest.mark.parametrize("text", ["{", "[]", "{}", '{"schema_version": 99, "benchmarks": {}}'])

@@ -120,6 +120,7 @@ def test_faults_of_files_are_refused_on_tracks(tracks: RecordedSequence) -> None
         ("imu_out_of_order", "imu_out_of_order"),
         ("imu_nan", "imu_not_finite"),
         ("imu_missing", "imu_gap"),
+        ("imu_dropped", "imu_sample_missing"),
     ],
 )
 def test_the_imu_is_cleaned_as_by_a_reader(tracks: RecordedSequence, name: str, kind: str) -> None:
@@ -129,6 +130,14 @@ def test_the_imu_is_cleaned_as_by_a_reader(tracks: RecordedSequence, name: str, 
     imu = faulty.imu()
     assert faulty.diagnostics.counts[kind] > before
     assert np.all(np.diff(imu.stamps_ns) > 0)
+
+
+def test_a_camera_without_images_is_counted_as_by_a_reader(images: RecordedSequence) -> None:
+    faulty = inject(images, [f"camera_lost:at_s={AT_S},camera=1"])
+    before = faulty.diagnostics.counts["camera_frame_missing"]
+    missing = sum(image is None for frame in faulty.frames() for image in frame.images)
+    assert missing > 0
+    assert faulty.diagnostics.counts["camera_frame_missing"] - before == missing
 
 
 def test_being_kidnapped_takes_time_out_of_everything(tracks: RecordedSequence) -> None:

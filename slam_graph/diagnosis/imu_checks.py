@@ -104,7 +104,8 @@ def _gaps(steps: FloatArray, period: float) -> list[Finding]:
     gaps = steps > _GAP_PERIODS * period
     if np.any(gaps):
         lost = float(np.sum(steps[gaps]) / np.sum(steps))
-        what = f"{np.sum(gaps)} gaps of the IMU, the longest {1e-9 * steps.max():.3f} s"
+        count, longest_s = int(np.sum(gaps)), 1e-9 * float(steps.max())
+        what = f"{count} gap{'s' * (count > 1)} of the IMU, the longest {longest_s:.3f} s"
         fix = "look for lost messages; backend.noise.max_imu_gap_s says what is bridged"
         found.append(Finding("imu_gaps", "warning" if lost > _LOST else "info", what, fix))
     jitter = float(np.sqrt(np.mean((steps[~gaps] - period) ** 2)) / period)

@@ -22,6 +22,7 @@ from slam_graph.datasets import Sequence
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.frontend import Feedback, Frontend
 from slam_graph.pipeline.forked_call import CallInTurn, ForkedCall
+from slam_graph.pipeline.frame_watch import FrameWatch
 from slam_graph.results import RunInput
 from slam_graph.sensors import AidingData, CameraFrame, FeatureFrame, ImuData, Packet, Rig
 
@@ -213,15 +214,20 @@ def can_overlap() -> bool:
 
 
 def packets_of(sequence: Sequence, asked: RunInput) -> Iterator[Packet]:
-    """The packets of the part that is asked for, with the cameras that are asked for."""
+    """The packets of the part that is asked for, with the cameras that are asked for.
+
+    What is wrong between frames is counted on the way.
+    """
     packets = sequence.packets(
         asked.start_ns if asked.config.start_s > 0 else None,
         asked.end_ns if asked.config.duration_s is not None else None,
     )
-    count = len(asked.rig.cameras)
+    count, watch = len(asked.rig.cameras), FrameWatch(asked.rig, sequence.diagnostics)
     for packet in packets:
         imu = packet.imu if asked.rig.has_imu else ImuData.empty()
-        yield Packet(imu, _first_cameras(packet.frame, count), packet.aiding)
+        frame = _first_cameras(packet.frame, count)
+        watch.look(frame)
+        yield Packet(imu, frame, packet.aiding)
 
 
 def _first_cameras(frame: CameraFrame | FeatureFrame, count: int) -> CameraFrame | FeatureFrame:

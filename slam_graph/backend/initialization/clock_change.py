@@ -34,8 +34,10 @@ class ClockChange:
     def message(self) -> str:
         """What has happened."""
         later = "later" if self.shift_s > 0.0 else "earlier"
+        sigma_ms = 1e3 * self.sigma_s
+        sigma = f" ± {sigma_ms:.1f}" if sigma_ms >= 0.05 else ""  # a gap of even stamps has none
         return (
-            f"the clock of the IMU is {1e3 * abs(self.shift_s):.1f} ± {1e3 * self.sigma_s:.1f} ms "
+            f"the clock of the IMU is {1e3 * abs(self.shift_s):.1f}{sigma} ms "
             f"{later} against the cameras since {self.since_ns} ns"
         )
 

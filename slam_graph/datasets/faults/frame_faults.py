@@ -135,6 +135,16 @@ class CameraLost(CameraFault):
     camera: int | None = Field(1, ge=0)
     """Which camera; all if it is null."""
 
+    def changed(self, frame: Frame, around: Surroundings, rng: np.random.Generator) -> Frame:
+        """The frame without images of the camera, which are counted as a reader does."""
+        left = super().changed(frame, around, rng)
+        if isinstance(frame, CameraFrame) and isinstance(left, CameraFrame):
+            for camera, was, now in zip(around.rig.cameras, frame.images, left.images, strict=True):
+                if was is not None and now is None:
+                    what = f"{camera.name} has no image at {frame.stamp_ns}"
+                    around.diagnostics.warn("camera_frame_missing", what)
+        return left
+
     def image(
         self, image: Image, camera: RigCamera, around: Surroundings, rng: np.random.Generator
     ) -> Image | None:

@@ -107,9 +107,9 @@ class FaultySequence(RecordedSequence):
         with closing(stream):
             for frame in stream:
                 if latest is not None and frame.stamp_ns <= latest:
-                    self.diagnostics.warn(
-                        "camera_out_of_order", f"{self.name}: frame at {frame.stamp_ns} dropped"
-                    )
+                    what = f"{self.name}: frame at {frame.stamp_ns} dropped"
+                    late = f"{what}, not later than the one before"
+                    self.diagnostics.warn("camera_out_of_order", late)
                     continue
                 latest = frame.stamp_ns
                 if end_ns is not None and frame.stamp_ns > end_ns:

@@ -139,7 +139,8 @@ class GroupedSequence(RecordedSequence):
     def _group(self, stamps: Sequence[IntArray], tolerance_s: float) -> Groups:
         groups = group_by_time(stamps, round(tolerance_s * 1e9))
         for stamp in groups.skipped:
-            self.diagnostics.warn("camera_out_of_order", f"{self.name}: frame at {stamp} dropped")
+            what = f"{self.name}: frame at {stamp} dropped, not in the order of time"
+            self.diagnostics.warn("camera_out_of_order", what)
         return groups
 
     def _report(

@@ -41,6 +41,14 @@ _SPIKE_SIGMAS = 10.0
 _SIGMA_OF_MEDIAN_DEVIATION = 1.4826
 """Standard deviation over median absolute deviation of a normal distribution."""
 
+_WHY = {
+    "imu_out_of_range": "beyond what sensors measure",
+    "imu_saturated": "an axis is at the end of its range",
+    "imu_stuck": "the sensor repeats its values",
+    "imu_spike": "far from the samples on either side",
+}
+"""Causes in words."""
+
 _CONTEXT = 128
 """Samples on either side that decide on one: more than any of the counts above."""
 
@@ -86,8 +94,8 @@ class _Judge:
         stuck = min(max(_STUCK, round(_STUCK_S * 1e9 / period_ns)), _CONTEXT)
         for kind, found in self._judged(np.hstack([data.gyro, data.accel]), stuck):
             for k in (np.flatnonzero(found[begin:end] & ~wrong[begin:end]) + begin).tolist():
-                what = f"IMU sample at {data.stamps_ns[k]} left out: {_values(data, k)}"
-                self._diagnostics.warn(kind, what)
+                sample = f"IMU sample at {data.stamps_ns[k]} left out, {_WHY[kind]}"
+                self._diagnostics.warn(kind, f"{sample}: {_values(data, k)}")
             wrong |= found
         rows = np.flatnonzero(~wrong[begin:end]) + begin
         if len(rows):

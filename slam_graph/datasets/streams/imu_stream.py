@@ -30,6 +30,10 @@ _GAP_PERIODS = 5.0
 """A pause longer than this many sampling periods counts as a gap. One or two lost samples do not
 hurt preintegration; five are 25 ms at 200 Hz, half the time between two frames."""
 
+_MISSING_PERIODS, _EVEN, _FEWEST_PAUSES = 1.5, 0.1, 16
+"""Samples are missing in a pause longer than so many periods, if the median pause differs from the
+period by less than this share of it; as seen in blocks of so many pauses or more."""
+
 SAMPLES_PER_BLOCK = 1024
 """Samples in memory that are cleaned at a time."""
 
@@ -41,7 +45,7 @@ class _ImuCleaner:
     """Drops samples that cannot be used, counts them, and reports gaps.
 
     Counted kinds: `imu_not_finite`, `imu_duplicate` (the stamp of the latest sample again),
-    `imu_out_of_order`, `imu_gap`.
+    `imu_out_of_order`, `imu_gap`, `imu_sample_missing` (fewer than a gap).
 
     Attributes:
         diagnostics: where faults are counted.
@@ -67,9 +71,11 @@ class _ImuCleaner:
             wanted = data.stamps_ns >= self.after_ns
         finite = np.isfinite(data.gyro).all(axis=1) & np.isfinite(data.accel).all(axis=1)
         for k in np.flatnonzero(wanted & ~finite):
-            self.diagnostics.warn("imu_not_finite", f"{where(int(k))}: sample dropped")
+            self.diagnostics.warn("imu_not_finite", f"{where(int(k))}: dropped, not finite")
         candidates = np.flatnonzero(wanted & finite)
         kept = self._in_order(data.stamps_ns, candidates, where)
+        if len(kept) == np.count_nonzero(wanted):  # what is dropped is said already
+            self._report_missing(data.stamps_ns[kept])
         self._report_gaps(data.stamps_ns[kept], lambda k: where(int(kept[k])))
         return ImuData(data.stamps_ns[kept], data.gyro[kept], data.accel[kept])
 
@@ -83,11 +89,32 @@ class _ImuCleaner:
         stamps = stamps_ns[candidates]
 
         def dropped(k: int, latest: int) -> None:
-            kind = "imu_duplicate" if stamps[k] == latest else "imu_out_of_order"
-            sample = f"{where(int(candidates[k]))}: sample at {stamps[k]}"
-            self.diagnostics.warn(kind, f"{sample} dropped, not in the order of time")
+            sample = f"{where(int(candidates[k]))}: sample at {stamps[k]} dropped"
+            if stamps[k] == latest:
+                self.diagnostics.warn("imu_duplicate", f"{sample}, there is one of that time")
+            else:
+                why = "earlier than the one before, or from the future"
+                self.diagnostics.warn("imu_out_of_order", f"{sample}, {why}")
 
         return candidates[in_order(stamps, dropped, self.latest_ns)]
+
+    def _report_missing(self, stamps_ns: IntArray) -> None:
+        """Count places in which a few samples are not there, if all others come evenly.
+
+        Args:
+            stamps_ns: (N,) of a block of which nothing was dropped.
+        """
+        pauses = np.diff(stamps_ns)
+        if len(pauses) < _FEWEST_PAUSES:
+            return
+        period_ns = float(np.median(pauses))
+        if float(np.median(np.abs(pauses - period_ns))) > _EVEN * period_ns:
+            return
+        few = (pauses > _MISSING_PERIODS * period_ns) & (pauses <= _GAP_PERIODS * period_ns)
+        for k in np.flatnonzero(few):
+            count = round(pauses[k] / period_ns) - 1
+            what = f"{count} sample{'s' * (count > 1)} of the IMU missing before {stamps_ns[k + 1]}"
+            self.diagnostics.warn("imu_sample_missing", what)
 
     def _report_gaps(self, stamps: IntArray, where: Callable[[int], str]) -> None:
         if len(stamps) == 0:
