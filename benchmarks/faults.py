@@ -49,6 +49,8 @@ CLIP_S = 17.0
 AT_S = 6.0
 ALGORITHMS = ("msckf", "swf", "okvis", "ekf", "fixed_lag_isam2")
 FAULTS = {
+    "single frames lost": ("frames_dropped:duration_s=4,share=0.1", 4.0),
+    "five frames lost at a time": ("frames_dropped:duration_s=4,share=0.3,burst=5", 4.0),
     "frames lost, 30 % over 4 s": ("frames_dropped:duration_s=4,share=0.3", 4.0),
     "no frames, 2 s": ("frames_dropped:duration_s=2", 2.0),
     "first camera lost, 3 s": ("camera_lost:duration_s=3,camera=0", 3.0),
@@ -61,6 +63,9 @@ FAULTS = {
     "frozen images, 3 s": ("image_frozen:duration_s=3", 3.0),
     "noise, 3 s": ("image_noise:duration_s=3", 3.0),
     "another place, 2 s": ("image_other_place:duration_s=2", 2.0),
+    "images of half the size, 3 s": ("image_size:duration_s=3", 3.0),
+    "images of 16 bits, 3 s": ("image_16_bit:duration_s=3", 3.0),
+    "images in colour, 3 s": ("image_colour:duration_s=3", 3.0),
     "no IMU, 1 s": ("imu_missing:duration_s=1", 1.0),
     "5 % of the IMU lost": ("imu_dropped:duration_s=4,share=0.05", 4.0),
     "IMU samples twice": ("imu_duplicated:duration_s=4", 4.0),
@@ -77,9 +82,11 @@ FAULTS = {
     "clock jumps by 5 s": ("clock_jump:by_s=5", 5.0),
     "clock jumps back by 1 s": ("clock_jump:by_s=-1", 0.0),
     "nothing, 3 s": ("all_missing:duration_s=3", 3.0),
+    "nothing, 10 s": ("all_missing:at_s=3,duration_s=10", 7.0),
     "carried away": ("kidnapped:duration_s=2", 0.0),
 }
-"""Faults as texts for `inject`, without the time, and how long they last, s."""
+"""Faults as texts for `inject`, from `AT_S` on unless they say another time, and how long after
+`AT_S` they end, s."""
 OF_TRACKS = {name: fault for name, fault in FAULTS.items() if not fault[0].startswith("image_")}
 """Those that recordings of tracks can have."""
 RECOVERY_BAR_S = 5.0
@@ -296,7 +303,7 @@ def _measured(
     texts = {"none": ("", 0.0)}
     for name, (text, lasts_s) in faults.items():
         kind, _, settings = text.partition(":")
-        at = f"at_s={AT_S:g}"
+        at = "" if "at_s=" in settings else f"at_s={AT_S:g}"
         texts[name] = (f"{kind}:{','.join(filter(None, [at, settings]))}", lasts_s)
     rows = [(recording, name, *texts[fault]) for name in algorithms for fault in texts]
     found = iter(in_parallel(survive, rows))
@@ -340,12 +347,12 @@ def fault_key(fault: str) -> str:
 
 BENCHMARKS = {
     "faults": Benchmark(
-        "29 faults put into MH_01, under five algorithms: how runs end, errors, time to recover",
+        f"{len(FAULTS)} faults put into MH_01, under five algorithms: how runs end, errors, time to recover",
         (RECORDING,),
         measure,
     ),
     "faults_tracks": Benchmark(
-        "23 faults put into tracks of OpenVINS' simulation, under five algorithms",
+        f"{len(OF_TRACKS)} faults put into tracks of OpenVINS' simulation, under five algorithms",
         (TRACKS,),
         measure_tracks,
     ),
