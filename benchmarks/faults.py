@@ -347,7 +347,7 @@ def fault_key(fault: str) -> str:
 
 BENCHMARKS = {
     "faults": Benchmark(
-        f"{len(FAULTS)} faults put into MH_01, under five algorithms: how runs end, errors, recovery",
+        f"{len(FAULTS)} faults in MH_01, under five algorithms: how runs end, errors, recovery",
         (RECORDING,),
         measure,
     ),
