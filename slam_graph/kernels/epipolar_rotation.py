@@ -98,6 +98,46 @@ def _median(values: FloatArray) -> float:
 
 
 @compiled()
+def _smallest(scatter: FloatArray, noise: FloatArray, t: FloatArray) -> float:
+    """The smallest λ of S t = λ N t, and its t (3,) with tᵀ N t = 1; NaN if N is singular."""
+    L, whitened, V = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
+    for i in range(3):  # Cholesky's L of the noise
+        for k in range(i + 1):
+            value = noise[i, k]
+            for m in range(k):
+                value -= L[i, m] * L[k, m]
+            if k < i:
+                L[i, k] = value / L[k, k]
+            elif value > 0.0:
+                L[i, i] = math.sqrt(value)
+            else:
+                return np.nan
+    for i in range(3):  # L⁻¹ S
+        for k in range(3):
+            value = scatter[i, k]
+            for m in range(i):
+                value -= L[i, m] * whitened[m, k]
+            whitened[i, k] = value / L[i, i]
+    for i in range(3):  # and L⁻¹ S L⁻ᵀ
+        for k in range(3):
+            for m in range(i):
+                whitened[k, i] -= L[i, m] * whitened[k, m]
+            whitened[k, i] /= L[i, i]
+    _diagonalize(whitened, V)
+    least = 0
+    for k in range(1, 3):
+        if whitened[k, k] < whitened[least, least]:
+            least = k
+    for i in range(2, -1, -1):
+        t[i] = V[i, least]
+        for m in range(i + 1, 3):
+            t[i] -= L[m, i] * t[m]
+        t[i] /= L[i, i]
+    smallest: float = whitened[least, least]
+    return smallest
+
+
+@compiled()
 def _find_direction(
     first: FloatArray,
     second: FloatArray,
@@ -113,10 +153,11 @@ def _find_direction(
 ) -> bool:
     """Fill what a rotation and weights make of the bearings; whether there is noise.
 
-    That are the second bearings turned by R, (N, 3), the normals (N, 3) of the epipolar planes, and
-    direction, tangent and information of `_Pair.direction`.
+    These are the second bearings turned by R, (N, 3), the normals (N, 3) of the epipolar planes,
+    the direction t, two unit vectors (2, 3) across it, and the information (2, 2) along these.
+    Where normals are to count alike, the weights are those that give them one length.
     """
-    scatter, noise, L = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
+    scatter, noise = np.empty((3, 3)), np.empty((3, 3))
     for i in range(3):
         for k in range(3):
             scatter[i, k] = noise[i, k] = 0.0
@@ -141,42 +182,12 @@ def _find_direction(
                 noise[i, k] -= (
                     of_second * first[n, i] * first[n, k] + of_first * turned[n, i] * turned[n, k]
                 )
-    whitened, V = np.empty((3, 3)), np.empty((3, 3))
-    for i in range(3):  # Cholesky's L of the noise
+    for i in range(3):
         noise[i, i] += sum_of_noise
-        for k in range(i + 1):
-            value = noise[i, k]
-            for m in range(k):
-                value -= L[i, m] * L[k, m]
-            if k < i:
-                L[i, k] = value / L[k, k]
-            elif value > 0.0:
-                L[i, i] = math.sqrt(value)
-            else:
-                return False
-    for i in range(3):  # L⁻¹ S
-        for k in range(3):
-            value = scatter[i, k]
-            for m in range(i):
-                value -= L[i, m] * whitened[m, k]
-            whitened[i, k] = value / L[i, i]
-    for i in range(3):  # and L⁻¹ S L⁻ᵀ
-        for k in range(3):
-            for m in range(i):
-                whitened[k, i] -= L[i, m] * whitened[k, m]
-            whitened[k, i] /= L[i, i]
-    _diagonalize(whitened, V)
-    least = 0
-    for k in range(1, 3):
-        if whitened[k, k] < whitened[least, least]:
-            least = k
-    square = 0.0
-    for i in range(2, -1, -1):
-        t[i] = V[i, least]
-        for m in range(i + 1, 3):
-            t[i] -= L[m, i] * t[m]
-        t[i] /= L[i, i]
-        square += t[i] * t[i]
+    least = _smallest(scatter, noise, t)
+    if math.isnan(least):
+        return False
+    square = t[0] * t[0] + t[1] * t[1] + t[2] * t[2]
     for i in range(3):
         t[i] /= math.sqrt(square)
     sign, scale = math.copysign(1.0, t[0]), 1.0 / (1.0 + abs(t[0]))
@@ -184,10 +195,10 @@ def _find_direction(
         across[i, 0] = -sign * t[1 + i]
         for k in range(2):
             across[i, 1 + k] = (1.0 if i == k else 0.0) - t[1 + i] * t[1 + k] * scale
-    # the noise along t is 1 / square
+    # relative to the noise along t: it was 1 before t had unit length, and is 1 / square now
     for i in range(3):
         for k in range(3):
-            scatter[i, k] -= whitened[least, least] * noise[i, k]
+            scatter[i, k] -= least * noise[i, k]
     for a in range(2):
         for b in range(2):
             value = 0.0
