@@ -18,7 +18,7 @@ from slam_graph.arrays import FloatArray
 from slam_graph.backend.backend_config import BackendConfig, InitializationConfig
 from slam_graph.backend.estimator import Estimator
 from slam_graph.backend.initialization.gyro_alignment import Turns, align_gyroscope
-from slam_graph.backend.initialization.visual_rotation import _Pair, _tangent, visual_rotation
+from slam_graph.backend.initialization.visual_rotation import visual_rotation
 from slam_graph.cli.main import app
 from slam_graph.config import load_config
 from slam_graph.datasets.calibration.kalibr_calibration import (
@@ -27,6 +27,7 @@ from slam_graph.datasets.calibration.kalibr_calibration import (
     write_kalibr,
 )
 from slam_graph.geometry.trajectory import NavState
+from slam_graph.kernels.epipolar_rotation_numpy import _Pair, _tangent
 from slam_graph.sensors.measurements import FeatureFrame, ImuData, Packet
 from slam_graph.sensors.rig import Rig
 from slam_graph.simulation.simulation_config import FlightConfig, SimulationConfig
@@ -72,14 +73,14 @@ def test_derivatives_of_the_epipolar_error_are_the_numerical_ones() -> None:
     first, second = rng.normal(size=(2, 20, 3))
     first, second = (f / np.linalg.norm(f, axis=1, keepdims=True) for f in (first, second))
     R, t = Rotation.from_rotvec([0.1, -0.2, 0.3]).as_matrix(), np.array([0.6, 0.0, 0.8])
-    sigmas, step = np.full((20, 2), 1e-3), 1e-6
-    pair = _Pair(first, second, sigmas, R)
+    variances, step = np.full((20, 2), 1e-6), 1e-6
+    pair = _Pair(first, second, variances, R)
     e, J, across = pair.residuals(t)[0], pair.jacobian(t), _tangent(t)
     np.testing.assert_allclose(across @ np.column_stack([across.T, t]), np.eye(3)[:2], atol=1e-15)
     for column in range(5):
         delta = step * np.eye(5)[column]
         turned = R @ Rotation.from_rotvec(delta[:3]).as_matrix()
-        moved, _ = _Pair(first, second, sigmas, turned).residuals(t + delta[3:] @ across)
+        moved, _ = _Pair(first, second, variances, turned).residuals(t + delta[3:] @ across)
         np.testing.assert_allclose((moved - e) / step, J[column], atol=1e-5)
 
 

@@ -23,6 +23,8 @@ from slam_graph.kernels.epipolar import (
     sampson_distances,
     sampson_distances_numpy,
 )
+from slam_graph.kernels.epipolar_rotation import _median, refine_rotation
+from slam_graph.kernels.epipolar_rotation_numpy import refine_rotation_numpy
 from slam_graph.kernels.feature_elimination import (
     eliminate_features,
     eliminate_features_numpy,
@@ -343,6 +345,44 @@ def test_epipolar_constraint() -> None:
     assert same(sampson_distances(F, a, b), sampson_distances_numpy(F, a, b))
     assert same(constraint_moments(a, b), constraint_moments_numpy(a, b))
     assert np.all(sampson_distances(np.zeros((3, 3)), a, b) == 0.0)
+
+
+@pytest.mark.parametrize("parallax", [0.3, 0.05, 0.0])
+@pytest.mark.parametrize("wrong", [0, 6])
+@pytest.mark.parametrize("count", [15, 16, 90])
+def test_refine_rotation(count: int, wrong: int, parallax: float) -> None:
+    rng = np.random.default_rng(11)
+    turn, away = (Rotation.from_rotvec(rng.normal(0.0, s, 3)).as_matrix() for s in (0.2, 0.05))
+    points = rng.uniform([-2.0, -2.0, 2.0], [2.0, 2.0, 8.0], (count, 3))
+    first, second = points, (points - [parallax, 0.0, 0.0]) @ turn
+    second[:wrong] = second[:wrong][::-1]
+    bearings = (f / np.linalg.norm(f, axis=1, keepdims=True) for f in (first, second))
+    first, second = (f + rng.normal(0.0, 1e-3, f.shape) for f in bearings)
+    variances, results = (1e-3 * rng.uniform(0.5, 1.5, (count, 2))) ** 2, []
+    for form in refine_rotation, refine_rotation_numpy:
+        R, information = turn @ away, np.empty((3, 3))
+        cost = form(first, second, variances, R, information)
+        results.append((R, information, np.array(cost)))
+    (R, *others), (expected, *other_form) = results
+    assert same(R, expected)
+    # the direction is an eigenvector: rounding over the distance of its eigenvalue to the next
+    assert all(same(a, b, 1e-9) for a, b in zip(others, other_form, strict=True))
+    error = Rotation.from_matrix(turn.T @ R).as_rotvec()
+    assert wrong > 0 or error @ others[0] @ error < 16.3  # χ² of three, p = 0.001
+
+
+@pytest.mark.parametrize("form", [refine_rotation, refine_rotation_numpy])
+def test_refine_rotation_without_noise_in_some_direction(form: Callable[..., float]) -> None:
+    ahead = np.tile([0.0, 0.0, 1.0], (20, 1))
+    assert form(ahead, ahead, np.full((20, 2), 1e-6), np.eye(3), np.empty((3, 3))) == np.inf
+
+
+@pytest.mark.parametrize("count", [1, 2, 15, 40])
+@pytest.mark.parametrize("different", [2, 1000])
+def test_median(count: int, different: int) -> None:
+    values = np.random.default_rng(12).integers(0, different, (20, count)).astype(float)
+    # compiled it is part of its kernel only
+    assert all(_median.py_func(row.copy()) == np.median(row) for row in values)
 
 
 def test_most_similar() -> None:

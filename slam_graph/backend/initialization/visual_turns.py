@@ -7,6 +7,7 @@ from __future__ import annotations
 from collections import deque
 from dataclasses import replace
 
+import gtsam
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -115,8 +116,8 @@ class VisualTurns:
             return None
         first_ns, second_ns, R, _ = self._turns[-1]
         ratio = (frame.stamp_ns - before.stamp_ns) / (second_ns - first_ns)
-        vector = Rotation.from_matrix(R).as_rotvec() * ratio
-        return np.asarray(Rotation.from_rotvec(vector).as_matrix())
+        vector = gtsam.Rot3.Logmap(gtsam.Rot3(R)) * ratio
+        return np.asarray(gtsam.Rot3.Expmap(vector).matrix())
 
     def covered(self, imu: ImuBuffer, fewest: int = MIN_TURNS) -> tuple[Turns, ImuData] | None:
         """The turns that the gyroscope covers, and its samples; None if they are too few.
