@@ -58,7 +58,7 @@ tables: $(VENV)/.installed  ## Write the tables of the documents from benchmarks
 	@$(BIN)/python -m benchmarks.tables
 
 clean:  ## Remove what was built, installed and cached, but no results
-	rm -rf $(VENV) build dist .pytest_cache .mypy_cache .ruff_cache
+	rm -rf $(VENV) build dist .pytest_cache .hypothesis .mypy_cache .ruff_cache
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 # The stamps: installed again only when a requirement or a pin has changed. The second and third

@@ -93,7 +93,7 @@ def read_rows(path: Path, rows_per_block: int = _ROWS_PER_BLOCK) -> Iterator[Row
         DataError: if the file cannot be opened.
     """
     try:
-        file = path.open(encoding="utf-8", errors="replace")
+        file = path.open(encoding="utf-8-sig", errors="replace")
     except OSError as error:
         raise DataError(f"{path}: cannot be read ({error.strerror})") from None
     with file:
