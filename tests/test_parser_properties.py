@@ -9,7 +9,6 @@ values with increasing times, or refused in one line.
 import bz2
 import logging
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +23,6 @@ from properties import (
     examples,
     finite,
     parsed,
-    poses,
     quaternions,
     rows_of,
     stamps,

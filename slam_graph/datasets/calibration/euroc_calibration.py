@@ -21,6 +21,12 @@ MAX_READOUT_S = 0.1
 _SAME_READOUT = 0.01
 """Largest relative difference of `readout_time` from `line_delay` times the height."""
 
+_LARGEST_SIZE = 2**16
+"""Most pixels of an image in a row, and most rows."""
+
+_LARGEST_RATE_HZ, _LARGEST_DENSITY = 1e6, 1e6
+"""More than any IMU has."""
+
 
 def read_camera(entry: YamlValue) -> Camera:
     """Intrinsics from a mapping with the keys that EuRoC and Kalibr share.
@@ -36,7 +42,7 @@ def read_camera(entry: YamlValue) -> Camera:
     model, distorted = _read_model(entry)
     intrinsics = entry.require("intrinsics")
     *leading, fx, fy, cx, cy = intrinsics.numbers(4 + model.leading)
-    width, height = entry.require("resolution").numbers(2)
+    width, height = _read_size(entry.require("resolution"))
     count = len(model.coefficient_names) - model.leading
     others = [0.0] * count
     if distorted and count:
@@ -45,9 +51,20 @@ def read_camera(entry: YamlValue) -> Camera:
     coefficients = (*leading, *others)
     try:
         model.check(coefficients)
-        return Camera(fx, fy, cx, cy, model.name, coefficients, int(width), int(height))
+        return Camera(fx, fy, cx, cy, model.name, coefficients, width, height)
     except DataError as error:
         raise DataError(f"{intrinsics.where}: {error}") from None
+
+
+def _read_size(value: YamlValue) -> tuple[int, int]:
+    """Width and height of an image."""
+    width, height = value.numbers(2)
+    if not all(1 <= size <= _LARGEST_SIZE and size == int(size) for size in (width, height)):
+        raise DataError(
+            f"{value.where}: an image of {width:g} x {height:g} pixels; expected whole numbers from "
+            f"1 to {_LARGEST_SIZE}"
+        )
+    return int(width), int(height)
 
 
 def _read_model(entry: YamlValue) -> tuple[CameraModel, bool]:
@@ -170,14 +187,29 @@ def shutter_entry(mounted: RigCamera) -> dict[str, Any]:
 
 
 def read_imu_noise(entry: YamlValue) -> ImuNoise:
-    """IMU noise from a mapping with the keys that EuRoC and Kalibr share."""
+    """IMU noise from a mapping with the keys that EuRoC and Kalibr share.
+
+    Raises:
+        DataError: naming file and line of what is missing, or can be no noise or rate.
+    """
+    rate = entry.require("rate_hz", "update_rate")
+    if not 0.0 < rate.number() <= _LARGEST_RATE_HZ:
+        raise DataError(f"{rate.where}: {rate.number():g} Hz cannot be the rate of an IMU")
     return ImuNoise(
-        gyro_noise_density=entry.require("gyroscope_noise_density").number(),
-        gyro_random_walk=entry.require("gyroscope_random_walk").number(),
-        accel_noise_density=entry.require("accelerometer_noise_density").number(),
-        accel_random_walk=entry.require("accelerometer_random_walk").number(),
-        rate_hz=entry.require("rate_hz", "update_rate").number(),
+        gyro_noise_density=_density(entry.require("gyroscope_noise_density")),
+        gyro_random_walk=_density(entry.require("gyroscope_random_walk")),
+        accel_noise_density=_density(entry.require("accelerometer_noise_density")),
+        accel_random_walk=_density(entry.require("accelerometer_random_walk")),
+        rate_hz=rate.number(),
     )
+
+
+def _density(value: YamlValue) -> float:
+    """A noise density; its square is used."""
+    number = value.number()
+    if not 0.0 <= number <= _LARGEST_DENSITY:
+        raise DataError(f"{value.where}: {number:g} cannot be a noise density")
+    return number
 
 
 def read_body_T_sensor(path: str | Path) -> gtsam.Pose3:
@@ -214,7 +246,7 @@ def read_euroc_rig(mav0: str | Path, cameras: Iterable[str], imu: str = "imu0") 
         camera = RigCamera(
             read_camera(entry),
             platform_T_imu.between(platform_T_camera),
-            0.0 if shift is None else shift.number(),
+            0.0 if shift is None else shift.seconds(),
             name,
         )
         mounted.append(with_shutter(camera, entry))
