@@ -17,7 +17,7 @@ PARALLEL ?= -n logical --dist loadfile
 export OPENBLAS_NUM_THREADS ?= 1
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test lint types check format docs bench gate tables clean
+.PHONY: help demo test slow lint types check format docs bench gate tables clean
 
 help:  ## List these commands
 	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "make %-8s %s\n", $$1, $$2 }' Makefile
@@ -30,6 +30,9 @@ demo: $(VENV)/.installed  ## Run on the recording that comes along (DATA=path fo
 
 test: $(VENV)/.installed-dev  ## Run the tests (SLAM_GRAPH_DATA=folder for those on recordings)
 	@$(BIN)/python -m pytest $(PARALLEL) $(ARGS)
+
+slow: $(VENV)/.installed-dev  ## Run the slow tests, which `make test` leaves out
+	@$(BIN)/python -m pytest -m slow $(ARGS)
 
 lint: $(VENV)/.installed-dev  ## Check style and formatting
 	@$(BIN)/ruff check .

@@ -194,7 +194,7 @@ def check_rig(rig: Rig) -> None:
         assert abs(mounted.time_offset_s) <= MAX_OFFSET_S
     *densities, rate_hz = astuple(rig.imu)
     assert 0.0 < rate_hz <= 1e6
-    assert all(0.0 <= density <= 1e6 for density in densities)
+    assert all(0.0 < density <= 1e6 for density in densities)
 
 
 YAML_VALUES = st.recursive(

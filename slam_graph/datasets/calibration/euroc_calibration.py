@@ -61,8 +61,8 @@ def _read_size(value: YamlValue) -> tuple[int, int]:
     width, height = value.numbers(2)
     if not all(1 <= size <= _LARGEST_SIZE and size == int(size) for size in (width, height)):
         raise DataError(
-            f"{value.where}: an image of {width:g} x {height:g} pixels; expected whole numbers from "
-            f"1 to {_LARGEST_SIZE}"
+            f"{value.where}: an image of {width:g} x {height:g} pixels; expected whole numbers "
+            f"from 1 to {_LARGEST_SIZE}"
         )
     return int(width), int(height)
 
@@ -192,23 +192,30 @@ def read_imu_noise(entry: YamlValue) -> ImuNoise:
     Raises:
         DataError: naming file and line of what is missing, or can be no noise or rate.
     """
-    rate = entry.require("rate_hz", "update_rate")
-    if not 0.0 < rate.number() <= _LARGEST_RATE_HZ:
-        raise DataError(f"{rate.where}: {rate.number():g} Hz cannot be the rate of an IMU")
     return ImuNoise(
-        gyro_noise_density=_density(entry.require("gyroscope_noise_density")),
-        gyro_random_walk=_density(entry.require("gyroscope_random_walk")),
-        accel_noise_density=_density(entry.require("accelerometer_noise_density")),
-        accel_random_walk=_density(entry.require("accelerometer_random_walk")),
-        rate_hz=rate.number(),
+        gyro_noise_density=noise_density(entry.require("gyroscope_noise_density")),
+        gyro_random_walk=noise_density(entry.require("gyroscope_random_walk")),
+        accel_noise_density=noise_density(entry.require("accelerometer_noise_density")),
+        accel_random_walk=noise_density(entry.require("accelerometer_random_walk")),
+        rate_hz=imu_rate(entry.require("rate_hz", "update_rate")),
     )
 
 
-def _density(value: YamlValue) -> float:
-    """A noise density; its square is used."""
+def noise_density(value: YamlValue) -> float:
+    """A noise density or random walk: positive, as its square is divided by."""
     number = value.number()
-    if not 0.0 <= number <= _LARGEST_DENSITY:
-        raise DataError(f"{value.where}: {number:g} cannot be a noise density")
+    if not 0.0 < number <= _LARGEST_DENSITY:
+        raise DataError(
+            f"{value.where}: {number:g} cannot be a noise density; expected 0 < … ≤ 1e6"
+        )
+    return number
+
+
+def imu_rate(value: YamlValue) -> float:
+    """The rate of an IMU, Hz."""
+    number = value.number()
+    if not 0.0 < number <= _LARGEST_RATE_HZ:
+        raise DataError(f"{value.where}: {number:g} Hz cannot be the rate of an IMU")
     return number
 
 

@@ -19,7 +19,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam_graph.datasets.calibration.calibration_yaml import read_yaml
-from slam_graph.datasets.calibration.euroc_calibration import read_camera
+from slam_graph.datasets.calibration.euroc_calibration import (
+    imu_rate,
+    noise_density,
+    read_camera,
+)
 from slam_graph.datasets.calibration.kalibr_calibration import read_kalibr
 from slam_graph.datasets.groundtruth import usable_states
 from slam_graph.datasets.sequence import (
@@ -80,11 +84,11 @@ def _read_rig(path: Path) -> Rig:
         raise DataError(f"{path}: no cameras in this file")
     imu = content.require("imu")
     noise = ImuNoise(
-        gyro_noise_density=imu.require("gyro_noise_density").number(),
-        gyro_random_walk=imu.require("gyro_random_walk").number(),
-        accel_noise_density=imu.require("accel_noise_density").number(),
-        accel_random_walk=imu.require("accel_random_walk").number(),
-        rate_hz=imu.require("rate_hz").number(),
+        gyro_noise_density=noise_density(imu.require("gyro_noise_density")),
+        gyro_random_walk=noise_density(imu.require("gyro_random_walk")),
+        accel_noise_density=noise_density(imu.require("accel_noise_density")),
+        accel_random_walk=noise_density(imu.require("accel_random_walk")),
+        rate_hz=imu_rate(imu.require("rate_hz")),
     )
     return Rig(tuple(cameras), noise)
 
