@@ -42,6 +42,7 @@ from slam_graph.datasets.calibration.euroc_calibration import MAX_READOUT_S, rea
 from slam_graph.datasets.calibration.kalibr_calibration import read_kalibr, write_kalibr
 from slam_graph.datasets.formats.euroc_writer import EurocWriter
 from slam_graph.geometry import NavState
+from slam_graph.maps import map_file
 from slam_graph.maps.map_file import arrays_of, read_map, write_map
 from slam_graph.maps.map_model import PoseSource, SlamMap
 from slam_graph.sensors import (
@@ -55,6 +56,7 @@ from slam_graph.sensors import (
     Rig,
     RigCamera,
 )
+from slam_graph.simulation.simulator import simulate
 
 pytestmark = pytest.mark.filterwarnings("error::RuntimeWarning")
 
@@ -430,6 +432,51 @@ def test_recordings(folder: Path, data: st.DataObject, name: str, width: int) ->
                 np.testing.assert_array_equal(one.descriptors, other.descriptors)
 
 
+@pytest.fixture(scope="module")
+def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A recording of three frames, ten features and five samples."""
+    root = tmp_path_factory.mktemp("tracks") / "flight"
+    simulate(duration_s=0.6, rate_hz=5.0, cameras=1, tracks={"features": 5}).save(root)
+    return root
+
+
+def check_recording(path: Path) -> None:
+    sequence = open_dataset(path)
+    last_ns = None
+    for packet in sequence.packets():
+        frame, times = packet.frame, packet.imu.stamps_ns
+        assert isinstance(frame, FeatureFrame)
+        assert last_ns is None or frame.stamp_ns > last_ns
+        last_ns = frame.stamp_ns
+        assert (times[1:] > times[:-1]).all()
+        assert np.isfinite([packet.imu.gyro, packet.imu.accel]).all()
+        for seen in frame.cameras:
+            assert np.isfinite([seen.pixels, seen.normalized]).all()
+
+
+@pytest.mark.parametrize("name", ["frames.bin", "features.bin", "imu.bin"])
+@examples(25)
+@given(data=st.data())
+def test_recordings_of_other_numbers(flight: Path, name: str, data: st.DataObject) -> None:
+    """Files of the right length, with some rows or all of any eight bytes."""
+    file = flight / name
+    whole = file.read_bytes()
+    words = [whole[k : k + 8] for k in range(0, len(whole), 8)]
+    number = st.one_of(
+        st.floats().map(lambda value: struct.pack("<d", value)),
+        st.integers(-(2**63), 2**63 - 1).map(lambda value: struct.pack("<q", value)),
+        st.integers(-3, 20).map(lambda value: struct.pack("<q", value)),
+    )
+    places = st.integers(0, len(words) - 1)
+    for place in data.draw(st.lists(places, min_size=1, max_size=8)):
+        words[place] = data.draw(number)
+    try:
+        file.write_bytes(b"".join(words))
+        parsed(check_recording, flight)
+    finally:
+        file.write_bytes(whole)
+
+
 # --- maps -----------------------------------------------------------------------------------------
 
 WALL = World().map(range(3))
@@ -474,6 +521,25 @@ def test_maps(folder: Path, content: SlamMap) -> None:
     for name, array in arrays_of(found).items():
         rounded = "quaternions" in name
         np.testing.assert_allclose(array, wanted[name], rtol=0.0, atol=1e-14 if rounded else 0.0)
+
+
+@examples(60)
+@given(data=st.data(), name=st.sampled_from(sorted(arrays_of(WALL))))
+def test_maps_of_other_numbers(folder: Path, data: st.DataObject, name: str) -> None:
+    """Some values of an array are any of its type."""
+    array = np.array(arrays_of(WALL)[name])
+    kinds = {"f": st.floats(), "i": st.integers(-(2**63), 2**63 - 1) | st.integers(-2, 9)}
+    values = kinds.get(array.dtype.kind, st.integers(0, 255))
+    for _ in range(data.draw(st.integers(1, 4)) if array.size else 0):
+        array.ravel()[data.draw(st.integers(0, array.size - 1))] = data.draw(values)
+    path = folder / "other.slam"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(map_file, "arrays_of", lambda content: arrays_of(content) | {name: array})
+        write_map(path, WALL)
+    found = parsed(read_map, path)
+    if found is not None:
+        for values_of_one in arrays_of(found).values():
+            assert np.isfinite(values_of_one).all()
 
 
 # --- bags -----------------------------------------------------------------------------------------
