@@ -17,6 +17,7 @@ from slam_graph.datasets.calibration.euroc_calibration import read_body_T_sensor
 from slam_graph.datasets.streams.csv_rows import (
     STAMP_TEXT,
     Rows,
+    are_times,
     read_rows,
     stamps_from_seconds,
 )
@@ -157,7 +158,7 @@ def _usable(
     diagnostics: Diagnostics,
 ) -> NDArray[np.intp]:
     """Indices of the rows that are finite, have a rotation, and are later than those before."""
-    whole = np.isfinite(values).all(axis=1)
+    whole = np.isfinite(values).all(axis=1) & are_times(stamps)
     lengths = lengths_of(values[:, 3:7])
     whole &= (lengths > _SMALLEST_QUATERNION) & np.isfinite(lengths)
     for k in np.flatnonzero(~whole):

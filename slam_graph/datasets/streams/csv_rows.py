@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from slam_graph.arrays import BoolArray, IntArray
 from slam_graph.errors import DataError
 
 _ROWS_PER_BLOCK = 1024
@@ -136,6 +137,11 @@ def _loadtxt(
         lines, dtype=np.dtype(dtype), delimiter=delimiter, usecols=columns, comments=None, ndmin=1
     )
     return table
+
+
+def are_times(stamps_ns: IntArray) -> BoolArray:
+    """Which stamps (N,) are near enough to zero to be times; so their differences fit, too."""
+    return np.asarray((stamps_ns > -LARGEST_STAMP_NS) & (stamps_ns < LARGEST_STAMP_NS), np.bool_)
 
 
 def stamp_from_seconds(text: bytes | str, rows: Rows, index: int) -> int:
