@@ -133,6 +133,8 @@ def _loadtxt(
 ) -> NDArray[Any]:
     if not lines:
         return np.zeros(0, np.dtype(dtype))
+    if not all(map(str.isascii, lines)):  # NumPy reads out of bounds, and may crash, on others
+        lines = [line.encode("ascii", errors="replace").decode() for line in lines]
     table: NDArray[Any] = np.loadtxt(
         lines, dtype=np.dtype(dtype), delimiter=delimiter, usecols=columns, comments=None, ndmin=1
     )
