@@ -17,7 +17,7 @@ PARALLEL ?= -n logical --dist loadfile
 export OPENBLAS_NUM_THREADS ?= 1
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test lint types check format docs bench gate tables clean
+.PHONY: help demo test slow lint types check format docs bench gate tables clean
 
 help:  ## List these commands
 	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "make %-8s %s\n", $$1, $$2 }' Makefile
@@ -30,6 +30,9 @@ demo: $(VENV)/.installed  ## Run on the recording that comes along (DATA=path fo
 
 test: $(VENV)/.installed-dev  ## Run the tests (SLAM_GRAPH_DATA=folder for those on recordings)
 	@$(BIN)/python -m pytest $(PARALLEL) $(ARGS)
+
+slow: $(VENV)/.installed-dev  ## Run the slow tests, which `make test` leaves out
+	@$(BIN)/python -m pytest -m slow $(ARGS)
 
 lint: $(VENV)/.installed-dev  ## Check style and formatting
 	@$(BIN)/ruff check .
@@ -58,7 +61,7 @@ tables: $(VENV)/.installed  ## Write the tables of the documents from benchmarks
 	@$(BIN)/python -m benchmarks.tables
 
 clean:  ## Remove what was built, installed and cached, but no results
-	rm -rf $(VENV) build dist .pytest_cache .mypy_cache .ruff_cache
+	rm -rf $(VENV) build dist .pytest_cache .hypothesis .mypy_cache .ruff_cache
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 # The stamps: installed again only when a requirement or a pin has changed. The second and third

@@ -20,6 +20,7 @@ from threadpoolctl import threadpool_limits
 
 from benchmarks.clocks import Watch, hold_to_one_core, time_flow
 from benchmarks.speed_worker import memory_mb, peak_memory_mb
+from slam_graph.backend import Estimator
 from slam_graph.config import load_config
 from slam_graph.pipeline.observers import NullProgress, NullViewer
 from slam_graph.pipeline.run_recording import run
@@ -55,6 +56,7 @@ class Clock(NullViewer, NullProgress):
         flows: time of the reference, for each `FLOW_EVERY` frames.
         frames: time of each frame: simulation, back end, and what is noted of it and saved.
         memory: resident memory at the times of the reference, MB.
+        poses, features: in the state after each frame.
         causal_s: CPU time of the process at the last frame.
         late_flows: time of the reference after each step of the final bundle adjustment.
         late_s: CPU time that these took, with the search for corners.
@@ -64,6 +66,8 @@ class Clock(NullViewer, NullProgress):
         self.flows = Watch()
         self.frames = Watch()
         self.memory: list[float] = []
+        self.poses: list[int] = []
+        self.features: list[int] = []
         self.causal_s = self.late_s = 0.0
         self.late_flows = Watch()
         noise = np.random.default_rng(0).integers(0, 255, IMAGE_SIZE, np.uint8)
@@ -73,9 +77,12 @@ class Clock(NullViewer, NullProgress):
         """The first frame begins."""
         self.frames.start()
 
-    def show(self, frame: EstimatedFrame, estimator: object) -> None:
+    def show(self, frame: EstimatedFrame, estimator: Estimator) -> None:
         """A frame is done; then the next one begins."""
         self.frames.stop()
+        window = estimator.window
+        self.poses.append(0 if window is None else len(window.past))
+        self.features.append(0 if window is None else len(window.state_features))
         if len(self.frames.cpu) % FLOW_EVERY == 0:
             time_flow(self._before, self._after, self.flows)
             self.memory.append(memory_mb())
@@ -110,6 +117,8 @@ def main(algorithm: str, duration_s: str, complete: str = "") -> None:
         "frame": clock.frames.cpu.tolist(),
         "reference": clock.flows.cpu.tolist(),
         "memory": clock.memory,
+        "poses": clock.poses,
+        "features": clock.features,
         "peak_mb": peak_memory_mb(),
         "after_s": after_s,
         "late_reference": clock.late_flows.cpu.tolist(),

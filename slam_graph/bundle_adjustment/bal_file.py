@@ -10,6 +10,7 @@ white space.
 from __future__ import annotations
 
 import bz2
+from codecs import BOM_UTF8
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -44,7 +45,7 @@ def is_bal(path: Path) -> bool:
         if compressed:
             return True  # no other supported format is compressed
         with path.open("rb") as file:
-            start = file.read(_MAX_HEADER_BYTES).split(b"\n")
+            start = file.read(_MAX_HEADER_BYTES).removeprefix(BOM_UTF8).split(b"\n")
     except OSError as error:
         raise DataError(f"{path}: cannot be read ({error.strerror})") from None
     words = next((line.split() for line in start if line.strip()), [])
@@ -106,7 +107,7 @@ def _text(path: Path) -> str:
         raise DataError(f"{path}: cannot be read ({reason})") from None
     except ValueError as error:
         raise DataError(f"{path}: cannot be read ({error})") from None
-    return content.decode("ascii", errors="replace")
+    return content.removeprefix(BOM_UTF8).decode("ascii", errors="replace")
 
 
 def _unpacked(content: bytes) -> bytes:

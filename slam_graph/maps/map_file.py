@@ -10,6 +10,7 @@ and its values afterwards (`_check_map`).
 from __future__ import annotations
 
 import json
+import re
 import struct
 import zipfile
 from collections.abc import Iterator
@@ -59,6 +60,11 @@ ARRAYS: dict[str, tuple[str, _Shape]] = {
     "word_weights": ("<f8", ("W",)),
 }
 """Type and shape of every array; sizes of one letter are the same everywhere."""
+
+_NOT_YAML = re.compile(
+    "[^ -~\xa0-\u2027\u202a-\ud7ff\ue000-\ufefe\uff00-\ufffd\U00010000-\U0010ffff]"
+)
+"""Characters that cannot stand in a string of YAML as they are."""
 
 _READ_ERRORS = (zipfile.BadZipFile, EOFError, ValueError, struct.error, RuntimeError, OverflowError)
 """Exceptions of damaged archives and arrays."""
@@ -302,8 +308,18 @@ def _poses(arrays: dict[str, NDArray[Any]], prefix: str, path: Path) -> Poses:
 
 def _recording(entry: _Recording, path: Path) -> MapRecording:
     """A recording with its calibration."""
-    rig = rig_from_kalibr(json.dumps(entry.calibration), path / HEADER)
+    rig = rig_from_kalibr(_yaml_text(entry.calibration), path / HEADER)
     return MapRecording(entry.name, entry.poses, rig)
+
+
+def _yaml_text(table: dict[str, Any]) -> str:
+    """A table as JSON that is YAML too.
+
+    YAML does not know JSON's pairs of escapes for characters beyond 16 bits, so these stand as they
+    are; it refuses or folds some others, which are escaped.
+    """
+    text = json.dumps(table, ensure_ascii=False)
+    return _NOT_YAML.sub(lambda found: f"\\u{ord(found[0]):04x}", text)
 
 
 def _check_map(content: SlamMap, path: Path) -> None:

@@ -160,7 +160,7 @@ def read_pose_graph(
 def _by_kind(path: Path, diagnostics: Diagnostics) -> dict[str, Rows]:
     """The lines of a file by their first word; unknown kinds are counted."""
     try:
-        lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
+        lines = path.read_text(encoding="utf-8-sig", errors="replace").splitlines()
     except OSError as error:
         raise DataError(f"{path}: cannot be read ({error.strerror})") from None
     kinds: dict[str, Rows] = {}

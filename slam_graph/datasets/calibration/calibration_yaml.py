@@ -130,7 +130,7 @@ def read_yaml(path: str | Path) -> YamlValue:
     """
     path = Path(path)
     try:
-        text = path.read_text(encoding="utf-8")
+        text = path.read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
         reason = error.strerror if isinstance(error, OSError) else "not text"
         raise DataError(f"{path}: calibration cannot be read ({reason})") from None

@@ -63,7 +63,7 @@ def read_calibration(path: Path) -> CalibrationFile:
         DataError: if it cannot be read.
     """
     try:
-        text = path.read_text(encoding="utf-8", errors="replace")
+        text = path.read_text(encoding="utf-8-sig", errors="replace")
     except OSError as error:
         raise DataError(f"{path}: calibration cannot be read ({error.strerror})") from None
     values = {}

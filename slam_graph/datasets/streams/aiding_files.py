@@ -204,8 +204,8 @@ def _header(path: Path) -> tuple[str, Datum | None]:
     first = ""
     datum: Datum | None = None
     cells: list[float]
-    with path.open(encoding="utf-8", errors="replace") as file:
-        for number, line in enumerate(file):
+    with path.open(encoding="utf-8-sig", errors="replace") as file:
+        for number, line in enumerate(map(str.strip, file)):
             first = first or line.lower()
             if line.startswith(_DATUM):
                 try:
@@ -220,7 +220,7 @@ def _header(path: Path) -> tuple[str, Datum | None]:
                 datum = cells[0], cells[1], cells[2]
             if "timestamp" in line.lower():
                 first = line.lower()
-            elif not line.startswith("#"):
+            elif line and line[0] not in "#%":
                 break
     return first, datum
 

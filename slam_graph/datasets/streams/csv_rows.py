@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from slam_graph.arrays import BoolArray, FloatArray
+from slam_graph.arrays import BoolArray, FloatArray, IntArray
 from slam_graph.errors import DataError
 
 _ROWS_PER_BLOCK = 1024
@@ -97,7 +97,7 @@ def read_rows(path: Path, rows_per_block: int = _ROWS_PER_BLOCK) -> Iterator[Row
         DataError: if the file cannot be opened.
     """
     try:
-        file = path.open(encoding="utf-8", errors="replace")
+        file = path.open(encoding="utf-8-sig", errors="replace")
     except OSError as error:
         raise DataError(f"{path}: cannot be read ({error.strerror})") from None
     with file:
@@ -136,10 +136,17 @@ def _loadtxt(
 ) -> NDArray[Any]:
     if not lines:
         return np.zeros(0, np.dtype(dtype))
+    if not all(map(str.isascii, lines)):  # NumPy reads out of bounds, and may crash, on others
+        lines = [line.encode("ascii", errors="replace").decode() for line in lines]
     table: NDArray[Any] = np.loadtxt(
         lines, dtype=np.dtype(dtype), delimiter=delimiter, usecols=columns, comments=None, ndmin=1
     )
     return table
+
+
+def are_times(stamps_ns: IntArray) -> BoolArray:
+    """Which stamps (N,) are near enough to zero to be times; so their differences fit, too."""
+    return np.asarray((stamps_ns > -LARGEST_STAMP_NS) & (stamps_ns < LARGEST_STAMP_NS), np.bool_)
 
 
 def stamp_from_seconds(text: bytes | str, rows: Rows, index: int) -> int:

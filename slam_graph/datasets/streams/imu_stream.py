@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from slam_graph.arrays import IntArray
 from slam_graph.datasets.streams.csv_rows import (
     Rows,
+    are_times,
     count_rows,
     read_rows,
     refuse_wild_stamps,
@@ -70,6 +71,7 @@ class _ImuCleaner:
         if self.after_ns is not None:
             wanted = data.stamps_ns >= self.after_ns
         finite = np.isfinite(data.gyro).all(axis=1) & np.isfinite(data.accel).all(axis=1)
+        finite &= are_times(data.stamps_ns)
         for k in np.flatnonzero(wanted & ~finite):
             self.diagnostics.warn("imu_not_finite", f"{where(int(k))}: dropped, not finite")
         candidates = np.flatnonzero(wanted & finite)

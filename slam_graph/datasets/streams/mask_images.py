@@ -161,7 +161,7 @@ def read_classes(folder: Path) -> dict[int, str]:
     if not path.exists():
         return {}
     try:
-        lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
+        lines = path.read_text(encoding="utf-8-sig", errors="replace").splitlines()
     except OSError as error:
         raise DataError(f"{path}: cannot be read ({error.strerror})") from error
     classes = {}
