@@ -106,8 +106,12 @@ def test_a_run_without_a_start_says_the_likeliest_cause(
 ) -> None:
     result = result_of(broken(recorded()))
     assert result.status == "not_initialized"
-    assert "likeliest cause: " in result.message
-    assert cause in result.message
+    waits = result.ending.waiting_for
+    assert "likeliest cause: " in waits
+    assert cause in waits
+    certain = broken is in_g  # the diagnosis of the whole run, which is the message then
+    assert (waits in result.message) == (not certain)
+    assert ("its unit is g;" in result.message) == certain
     assert "\n" not in result.message
 
 

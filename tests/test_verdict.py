@@ -218,9 +218,57 @@ def test_a_failed_run_names_the_likeliest_cause() -> None:
     sequence.rig = changed(
         sequence.rig, lambda camera: replace(camera, body_T_camera=camera.body_T_camera.inverse())
     )
-    result = run(sequence, overrides=CAUSAL)
+    result = run(sequence, overrides=(*CAUSAL, "limits.refuse_wrong_setup=false"))
     assert result.status in ("not_initialized", "diverged", "low_coverage")
     assert "slam-graph doctor says: the camera is turned" in result.message
+    assert "likeliest cause" not in result.message, "it would contradict what is certain"
+
+
+@pytest.mark.parametrize("fault", ["extrinsics", "gyroscope"])
+def test_a_wrong_setup_that_starts_is_refused_where_its_estimate_is_lost(fault: str) -> None:
+    """A start at rest shows nothing of it."""
+    sequence = simulate(trajectory="figure8", cameras=2, duration_s=20.0, seed=1)
+    rig = inverted(sequence.rig) if fault == "extrinsics" else sequence.rig
+    axes, imu = [0, 1, 2] if fault == "extrinsics" else [1, 0, 2], sequence.imu()
+    recording = dataset_from_arrays(
+        rig,
+        imu_stamps_ns=imu.stamps_ns,
+        gyro=imu.gyro[:, axes],
+        accel=imu.accel,
+        features=[f for f in sequence.frames() if isinstance(f, FeatureFrame)],
+    )
+    result = run(recording, overrides=CAUSAL)
+    assert result.status == "failed"
+    assert result.message.startswith("the estimate was lost"), result.message
+    assert "slam-graph doctor" in result.message
+    assert not result.segments.lasted
+    assert result.logs.frames / 20.0 < 11.0
+
+
+@pytest.mark.parametrize("at_s", [2.5, 4.5])
+def test_a_good_flight_that_is_lost_soon_is_not_refused(at_s: float) -> None:
+    """Whatever happened then, the calibration does not explain it."""
+    flight = simulate(trajectory="figure8", cameras=2, duration_s=14.0, seed=2)
+    result = run(inject(flight, [f"kidnapped:at_s={at_s},duration_s=2.5"]), overrides=CAUSAL)
+    assert result.segments.lost
+    assert result.status == "ok", result.message
+
+
+@pytest.mark.parametrize(
+    ("duration_s", "faults"),
+    [
+        (8.0, ["imu_zeros:at_s=4,duration_s=1", "frames_dropped:at_s=6,duration_s=0.5"]),
+        (9.0, ["frames_dropped:at_s=6.6,duration_s=0.7", "gyro_outlier:at_s=3.5"]),
+    ],
+)
+def test_faults_that_leave_little_to_compare_make_no_calibration_wrong(
+    duration_s: float, faults: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A standstill and seconds of motion: other mountings and axes fit, the given ones too."""
+    monkeypatch.setattr(verdict, "_MAX_REJECTED", -1.0)  # every run is diagnosed
+    recording = open_dataset("demo", faults=faults)
+    result = run(recording, overrides=CAUSAL, duration_s=duration_s)
+    assert result.status == "ok", result.message
 
 
 @pytest.mark.parametrize("with_imu", [True, False])

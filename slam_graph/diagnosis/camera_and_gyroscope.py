@@ -129,16 +129,22 @@ def refine(rig: Rig, parts: list[Part]) -> CameraAndGyroscope:
 
 
 def _calibration_is_better(problem: RotationProblem, start: Kinematics, fit: RotationFit) -> bool:
-    """Whether most features fit the calibration as it is clearly better than what was found.
+    """Whether the features fit the calibration as it is better than what was found.
 
-    Gauss-Newton minimises weighted squares, and a few pairs that hardly move can lead it away.
+    Gauss-Newton minimises weighted squares, and a few pairs that hardly move can lead it away, to
+    where its covariance means nothing. So the calibration, with a bias alone, counts as right where
+    most features fit it clearly better, or all of them together no worse.
     """
-    calibrated = problem.noise_px(start)
+    calibrated, at = problem.noise_px(start), start
     if calibrated * CLEARLY > fit.noise_px:
         with suppress(np.linalg.LinAlgError):
             bias = problem.solve(start, ("bx", "by", "bz"))
-            calibrated = min(calibrated, bias.noise_px)
-    return calibrated * CLEARLY < fit.noise_px
+            if bias.noise_px < calibrated:
+                calibrated, at = bias.noise_px, bias.values
+    if calibrated * CLEARLY < fit.noise_px:
+        return True
+    misfits = [problem.misfit(values, fit.noise_px) for values in (at, fit.values)]
+    return misfits[0] <= misfits[1]
 
 
 def _turning(now: CameraAndGyroscope, pairs: list[FramePair]) -> Turning | None:

@@ -186,21 +186,25 @@ class Diagnosis:
         """Errors of calibration, units and clocks, and warnings of the stereo geometry.
 
         Other warnings do not count: small turns of the camera and errors of the focal length are
-        found in good flights too, and a clock that is off by milliseconds spoils nothing.
+        found in good flights too, and a clock that is off by milliseconds spoils nothing. Nor do
+        hints, which a few seconds of good flights may give.
         """
         return [
             finding
             for finding in self.faults
             if finding.kind in SETUP_KINDS
+            and finding.sure != "hint"
             and (finding.severity == "error" or finding.kind in _SURE_WARNINGS)
         ]
 
+    @property
+    def certain_errors(self) -> list[Finding]:
+        """Errors of calibration, units and clocks that are certain."""
+        return [f for f in self.setup_faults if f.severity == "error" and f.sure == "certain"]
+
     def best_guess(self) -> str:
         """The likeliest fault and what mends it, in one line; empty if none was found."""
-        if not self.faults:
-            return ""
-        first = self.faults[0]
-        return f"{first.what}; {first.fix}" if first.fix else first.what
+        return self.faults[0].with_fix if self.faults else ""
 
     def as_dict(self) -> Mapping[str, object]:
         """As it is printed by `--json`."""

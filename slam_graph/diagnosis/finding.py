@@ -39,6 +39,11 @@ class Finding:
     sigmas: float | None = None
     values: Mapping[str, object] = field(default_factory=dict)
 
+    @property
+    def with_fix(self) -> str:
+        """What was found and what mends it, in one line."""
+        return f"{self.what}; {self.fix}" if self.fix else self.what
+
     @staticmethod
     def measured(
         kind: str,

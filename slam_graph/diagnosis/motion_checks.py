@@ -118,7 +118,8 @@ def _axes(windows: list[Window]) -> tuple[FloatArray, list[Finding]]:
     solved = {k: [window.solve(candidates[k], 8) for window in windows] for k in best}
     k = min(best, key=lambda k: _score_of(solved[k]))
     P, score, usual = candidates[k], _score_of(solved[k]), _score_of(nominal)
-    # wrong axes spoil every window; a single one may end in a wrong minimum under right ones
+    # wrong axes spoil every window; a single one may end in a wrong minimum under right ones,
+    # which is why it is but a hint
     better = median_low((_sizes_px(nominal) / _sizes_px(solved[k])).tolist())
     unclear = min(better, usual / score) < _CLEARER or score > _FITS_PX
     if np.allclose(P, np.eye(3)) or unclear:
@@ -132,8 +133,9 @@ def _axes(windows: list[Window]) -> tuple[FloatArray, list[Finding]]:
         what = f"the accelerometer's axes should be read as {axes_text(P)}"
         fix = f"write the accelerations (x, y, z) as {axes_text(P)}"
     what = f"{what}: features are off by {usual:.2f} px in the mean, and then by {score:.2f} px"
-    sigmas = (usual / score - 1.0) * np.sqrt(100.0 * len(windows))
-    return P, [Finding.measured(found, "error", what, fix, float(sigmas), values)]
+    sigmas = float((usual / score - 1.0) * np.sqrt(100.0 * len(windows)))
+    finding = Finding.measured(found, "error", what, fix, sigmas, values)
+    return P, [finding if len(windows) > 1 else replace(finding, sure="hint")]
 
 
 def _score(windows: list[Window], P: FloatArray, steps: int) -> float:

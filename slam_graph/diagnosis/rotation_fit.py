@@ -248,6 +248,17 @@ class RotationProblem:
         known = self.bearings(at.focal)[2]
         return _noise(e[known]) if known.any() else np.inf
 
+    def misfit(self, at: Kinematics, noise: float) -> float:
+        """How badly all features fit together: minus their robust logarithmic likelihood.
+
+        Args:
+            at: values of the unknowns.
+            noise: standard deviation of the epipolar distances, pixels.
+        """
+        e = self.distances(at, self.directions(at, noise))
+        squares = np.log1p((e[self.bearings(at.focal)[2]] / (_CAUCHY * noise)) ** 2)
+        return 0.5 * _CAUCHY**2 * float(np.sum(squares))
+
     def solve(
         self,
         start: Kinematics,

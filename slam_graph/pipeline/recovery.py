@@ -18,11 +18,12 @@ from slam_graph.diagnostics import Diagnostics
 from slam_graph.geometry import NavState
 from slam_graph.pipeline.agreement import Agreement, DivergenceError, JumpError, check_sane
 from slam_graph.results import RunResult
+from slam_graph.results.segments import SHORT_S
 from slam_graph.sensors import ImuData
 
-_SHORT_S, _MOST_SHORT = 5.0, 3
-"""After so many segments in a row that each lasted less than this, the run is given up: not a
-fault that passes is the cause, but one that stays, such as a wrong calibration."""
+_MOST_SHORT = 3
+"""After so many short segments in a row the run is given up: not a fault that passes is the cause,
+but one that stays, such as a wrong calibration."""
 _REMEMBERED_NS = 30_000_000_000
 """States are remembered for so long: one of them is the last good one when the estimate is lost."""
 _MARGIN_NS = 500_000_000
@@ -120,7 +121,7 @@ class Recovery:
         lasted_s = result.segments.end(good_ns, str(lost))
         end_ns = result.segments[-1].end_ns if len(result.segments) else None
         result.forget_states(None if end_ns is None else end_ns + 1)
-        self._short = self._short + 1 if lasted_s < _SHORT_S else 0
+        self._short = self._short + 1 if lasted_s < SHORT_S else 0
         if self._short >= _MOST_SHORT:
             raise lost
         self._agreement = Agreement(result.config)

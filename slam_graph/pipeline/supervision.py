@@ -84,14 +84,14 @@ def _judge(result: RunResult, estimator: Estimator) -> None:
     """Whether a run that came to its end reached what was asked for."""
     asked, ending = result.config.min_coverage, result.ending
     lost = result.segments.lost
+    if not estimator.initialized:
+        ending.waiting_for = f": waiting for {estimator.waiting_for}"
     if not estimator.initialized and lost:
-        message = f"{lost}; the run did not start again: waiting for {estimator.waiting_for}"
+        message = f"{lost}; the run did not start again{ending.waiting_for}"
         ending.status, ending.message, ending.error = "diverged", message, DivergenceError(message)
     elif not estimator.initialized:
         ending.status = "not_initialized"
-        ending.message = (
-            f"never initialised in {result.logs.frames} frames: waiting for {estimator.waiting_for}"
-        )
+        ending.message = f"never initialised in {result.logs.frames} frames{ending.waiting_for}"
     elif result.coverage < asked:
         ending.status = "low_coverage"
         ending.message = (

@@ -33,7 +33,7 @@ _KEPT_NS = 24_000_000_000
 _PAIRS, _PAIRS_APART_NS = 4, 1_500_000_000
 """Images of two cameras that are kept, and the time between them."""
 _FIRST_LOOK_NS = 5_000_000_000
-"""A run that has waited so long for its first state is looked at, and again after twice that."""
+"""A run that has waited so long for a start is looked at, and again after twice that."""
 _FAILED = ("not_initialized", "diverged", "low_coverage")
 _DOUBTS = ("start_corrected", "new_segment", "scale_unknown")
 """Warnings after which an estimate that came to its end is doubted."""
@@ -128,18 +128,18 @@ class Verdict(Stage):
         self._clocks = ClockWatch(result, objects, diagnostics) if rig.has_imu else None
         self._estimated = self._at_limit = 0  # frames with a state; noise of the IMU at its limit
         self._started_ns: int | None = None
-        self._first_ns: int | None = None
+        self._waits_since_ns: int | None = None
+        self._look_ns = 0  # time of waiting after which the recording is looked at next
         config = result.config
-        refusing = config.limits.refuse_wrong_setup
-        refusing &= config.backend.initialization.check_calibration
-        self._look_ns = _FIRST_LOOK_NS if refusing else None
+        self._refuses = config.limits.refuse_wrong_setup
+        self._refuses &= config.backend.initialization.check_calibration
 
     def frame(self, frame: EstimatedFrame) -> None:
         """Keep a frame, unless there are enough after the start, and watch the clocks.
 
         Raises:
-            DataError: if the run waits for its first state, and what it was given is certainly
-                wrong.
+            DataError: if the run waits for a start, its estimate has never lasted, and what it was
+                given is certainly wrong.
         """
         stamp_ns = frame.features.stamp_ns
         if self._clocks is not None:
@@ -156,8 +156,8 @@ class Verdict(Stage):
             return
         self._kept.add(frame)
         if frame.initialized:
-            self._look_ns = None  # there is an estimate to go by
-        elif self._look_ns is not None:
+            self._waits_since_ns = None
+        elif self._refuses and not self._result.segments.lasted:
             self._watch_start(stamp_ns, frame.corrected_rig or self._result.input.rig)
 
     def finish(self) -> None:
@@ -204,22 +204,26 @@ class Verdict(Stage):
         return found.is_unusual, found.causes if found.contradicts else []
 
     def _watch_start(self, stamp_ns: int, rig: Rig) -> None:
-        """Look now and then what keeps a run from starting.
+        """Look now and then what keeps a run from starting; after a loss at once as well.
 
         Raises:
             DataError: if what the run was given is certainly wrong.
         """
-        if self._first_ns is None:
-            self._first_ns = stamp_ns
-        if self._look_ns is None or stamp_ns - self._first_ns < self._look_ns:
+        lost = bool(self._result.segments.lost)
+        if self._waits_since_ns is None:
+            self._waits_since_ns, self._look_ns = stamp_ns, 0 if lost else _FIRST_LOOK_NS
+        waited_ns = stamp_ns - self._waits_since_ns
+        if waited_ns < self._look_ns:
             return
-        self._look_ns *= 2
+        self._look_ns = max(2 * self._look_ns, _FIRST_LOOK_NS)
         causes = ""
         with warn_on_failure(self._diagnostics, "diagnosis_failed", "the cause is not looked for"):
             causes = self._certain_causes(rig)
         if causes:
-            waited_s = (stamp_ns - self._first_ns) * 1e-9
-            raise DataError(f"no start in {waited_s:.1f} s: {causes}; see `slam-graph doctor`")
+            waited = f"no start in {waited_ns * 1e-9:.1f} s"
+            if lost:
+                waited = f"the estimate was lost{', ' + waited if waited_ns else ''}"
+            raise DataError(f"{waited}: {causes}; see `slam-graph doctor`")
 
     def _certain_causes(self, rig: Rig) -> str:
         """What is certainly wrong, and is neither estimated nor corrected in a start."""
@@ -231,14 +235,9 @@ class Verdict(Stage):
             "mounting": calibration.extrinsics,
             "focal_length": calibration.intrinsics,
         }
-        certain = [
-            finding.what
-            for finding in self._diagnosed(rig).setup_faults
-            if finding.severity == "error"
-            and finding.sure == "certain"
-            and not estimated.get(finding.kind, False)
-        ]
-        return "; or ".join(certain[:2])
+        found = self._diagnosed(rig, across_losses=False).certain_errors
+        certain = [finding for finding in found if not estimated.get(finding.kind, False)]
+        return "; or ".join([f.with_fix for f in certain[:1]] + [f.what for f in certain[1:2]])
 
     def _judge(self, failed: bool, contradictions: list[str], clocks: Diagnosis | None) -> None:
         """Diagnose what was recorded, under the calibration that the run began or ended with.
@@ -253,6 +252,9 @@ class Verdict(Stage):
             found = found.with_clocks(clocks)
         ending, faults, guess = self._result.ending, found.setup_faults, found.best_guess()
         if failed and guess:
+            if found.certain_errors:  # what the estimator guesses may contradict it
+                guess = found.certain_errors[0].with_fix
+                ending.message = ending.message.removesuffix(ending.waiting_for)
             ending.message += f"; slam-graph doctor says: {guess}"
         elif faults and not failed:
             likely = "; or ".join(finding.what for finding in faults[:2])
@@ -270,13 +272,21 @@ class Verdict(Stage):
         ending.status = "suspect"
         ending.message = f"the estimate may be wrong: {why}"
 
-    def _diagnosed(self, rig: Rig) -> Diagnosis:
+    def _diagnosed(self, rig: Rig, across_losses: bool = True) -> Diagnosis:
+        """Diagnose what was recorded.
+
+        Args:
+            rig: the calibration.
+            across_losses: whether losses of the estimate are looked at where too little else is
+                left.
+        """
         from slam_graph.diagnosis import Diagnosis  # it takes a moment to import
 
-        kept = self._kept
-        return Diagnosis.of_tracks(
-            rig, kept.frames, kept.imu, kept.pairs, self._result.segments.losses
-        )
+        kept, losses = self._kept, self._result.segments.losses
+        frames = kept.frames
+        if not across_losses:
+            frames = [f for f in frames if not any(a < f.stamp_ns < b for a, b in losses)]
+        return Diagnosis.of_tracks(rig, frames, kept.imu, kept.pairs, losses)
 
     def _final_rig(self) -> Rig:
         """The rig as calibrated, corrected or estimated, whichever came last."""

@@ -59,9 +59,12 @@ class Ending:
         message: why it did not end well; empty if it did.
         error: what ended the run, if something was raised.
         wall_s: time that the run took, without smoothing, loop closure and map, s.
+        waiting_for: the end of the message of a run that waits for a start: what for, and what the
+            estimator takes for the likeliest cause.
     """
 
     status: Status = "ok"
     message: str = ""
     error: BaseException | None = None
     wall_s: float = 0.0
+    waiting_for: str = ""

@@ -20,6 +20,9 @@ from slam_graph.geometry import Trajectory
 JoinedBy = Literal["start", "imu", "none"]
 """Of the first segment, joined by the IMU, and not joined: its place is not known."""
 
+SHORT_S = 5.0
+"""A segment that lasts less is short: a wrong calibration may be what ends it."""
+
 _COLUMNS = (
     *("segment", "world", "begin_ns", "end_ns", "states", "joined_by"),
     *("sigma_x_m", "sigma_y_m", "sigma_z_m", "sigma_yaw_rad", "loops", "ended_by"),
@@ -124,6 +127,11 @@ class Segments:
     def goes_on(self) -> bool:
         """Whether the last segment has not ended."""
         return bool(self._all) and not self._all[-1].ended_by
+
+    @property
+    def lasted(self) -> bool:
+        """Whether a segment was good for so long that a wrong calibration is unlikely."""
+        return any(segment.seconds >= SHORT_S for segment in self._all)
 
     @property
     def later(self) -> list[Segment]:
