@@ -346,9 +346,9 @@ def _judge(now: CameraAndGyroscope, fit: RotationFit) -> None:
 def _agreement(fit: RotationFit, change_s: float, sigma: dict[str, float]) -> Finding:
     """That nothing is wrong, or that too little is known to say so."""
     figures = (
-        f"clocks differ by {round(1e3 * change_s, 1) + 0.0:.1f} ± {1e3 * sigma['offset']:.1f} ms, the focal length "
-        f"by {fit.values.focal - 1:.1%} ± {sigma['focal']:.1%}; epipolar distances are "
-        f"{fit.noise_px:.2f} px"
+        f"clocks differ by {round(1e3 * change_s, 1) + 0.0:.1f} ± {1e3 * sigma['offset']:.1f} ms, "
+        f"the focal length by {fit.values.focal - 1:.1%} ± {sigma['focal']:.1%}; "
+        f"epipolar distances are {fit.noise_px:.2f} px"
     )
     if sigma["offset"] < _KNOWN_OFFSET_S and sigma["focal"] < _KNOWN_FOCAL:
         text = f"camera and gyroscope agree: {figures}"
