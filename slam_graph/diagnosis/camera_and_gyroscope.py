@@ -203,15 +203,15 @@ def _unit(now: CameraAndGyroscope, pairs: list[FramePair], turning: Turning) -> 
     if same or factor <= 0.0 or turning.misfit > _FITS:
         return turning
     what = f"the gyroscope turns {factor:.3g} times as fast as the camera"
-    fix = f"divide the angular rates by {factor:.4g} to have rad/s"
+    fix, named = f"divide the angular rates by {factor:.4g} to have rad/s", ""
     for unit, ratio in _RATE_UNITS.items():
         if 1 / _UNIT_RATIO < factor / ratio < _UNIT_RATIO:
             what, fix = (
                 f"{what}: its unit is {unit}",
                 f"multiply the angular rates by {1 / ratio:g}",
             )
-            factor = ratio
-    values = {"factor": turning.factor}
+            factor, named = ratio, unit
+    values = {"factor": turning.factor, "unit": named}
     sigmas = 1.0 / max(turning.misfit, 1e-3) * np.sqrt(len(pairs))
     now.findings.append(Finding.measured("gyroscope_unit", "error", what, fix, sigmas, values))
     _replace_imu(now, np.eye(3) / factor)
@@ -275,13 +275,11 @@ def _solved(problem: RotationProblem, start: Kinematics) -> RotationFit | None:
 
 
 def _judge_scale(now: CameraAndGyroscope, problem: RotationProblem, fit: RotationFit) -> None:
-    """Whether the gyroscope has another scale, if mounting or focal length look wrong.
+    """Whether the gyroscope has another scale.
 
     For turns about the axes of the image a factor on the rates is like one on the focal length, and
     not for turns about the optical axis or at the edge of the image. What is found is corrected.
     """
-    if not (_is_turned(now, fit) or _is_magnified(fit)):
-        return
     try:
         wider = problem.solve(fit.values, WITH_SCALE)
     except np.linalg.LinAlgError:
@@ -290,6 +288,15 @@ def _judge_scale(now: CameraAndGyroscope, problem: RotationProblem, fit: Rotatio
     now.scale_sigma = sigma
     change = abs(float(np.log(scale)))
     if change < max(_SCALE * _noisier(wider), SIGMAS * sigma) or wider.noise_px > fit.noise_px:
+        return
+    coarse = _withdrawn_unit(now)  # where a wrong lens has made it of another unit at first
+    now.fit = replace(
+        wider, values=replace(wider.values, bias=wider.values.bias / scale, scale=1.0)
+    )
+    _replace_imu(now, np.eye(3) / scale)
+    scale *= coarse
+    change = abs(float(np.log(scale)))
+    if change < max(_SCALE * _noisier(wider), SIGMAS * sigma):
         return
     what = (
         f"the gyroscope turns {scale:.3f} ± {sigma:.3f} times as fast as the camera, about all "
@@ -300,10 +307,15 @@ def _judge_scale(now: CameraAndGyroscope, problem: RotationProblem, fit: Rotatio
     now.findings.append(
         Finding.measured("gyroscope_scale", severity, what, fix, change / sigma, values)
     )
-    _replace_imu(now, np.eye(3) / scale)
-    now.fit = replace(
-        wider, values=replace(wider.values, bias=wider.values.bias / scale, scale=1.0)
-    )
+
+
+def _withdrawn_unit(now: CameraAndGyroscope) -> float:
+    """The factor of a finding of a gyroscope's unit without a name, which is taken back; else 1."""
+    for finding in now.findings:
+        if finding.kind == "gyroscope_unit" and not finding.values["unit"]:
+            now.findings.remove(finding)
+            return float(str(finding.values["factor"]))
+    return 1.0
 
 
 def _judge(now: CameraAndGyroscope, fit: RotationFit) -> None:

@@ -12,7 +12,7 @@ from slam_graph.diagnosis.frame_pairs import FramePair
 from slam_graph.diagnosis.gathering import Part
 from slam_graph.diagnosis.gyroscope import Gyroscope
 
-_LEAST_TURN_RAD, _LEAST_SHARE = 0.02, 0.25
+_LEAST_TURN_RAD, _LEAST_SHARE = 0.01, 0.25
 """The camera turns about an axis from so much from frame to frame on, and from such a share of all
 of its turns on: a platform on a plane never turns about two of them."""
 _LEAST_CHANGE = 1.0

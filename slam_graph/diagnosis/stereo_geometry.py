@@ -24,12 +24,17 @@ _WORSE, _WORSE_PX = 2.0, 0.8
 and so much larger."""
 _FITS_PX = 2.5
 """No cause is named that leaves larger epipolar distances than this."""
+_SIMPLER = 1.3
+"""A factor on both focal lengths is likelier than another pose, with five unknowns, up to so many
+times its epipolar distances."""
 _AHEAD = 0.75
 """At least so many of the near points must be in front of both cameras."""
 _NEAR_PX = 3.0
 """Near points have at least this parallax."""
 _BASELINES_M = (0.004, 4.0)
 """Shortest and longest baseline that is plausible."""
+_FOCAL_STEP = 0.02
+"""Least change of a focal length that is named."""
 _FOCAL_STEPS = np.linspace(0.7, 1.45, 76)
 
 
@@ -49,19 +54,34 @@ class StereoPair:
         """Whether there are enough matches to judge."""
         return len(self.first) >= _FEWEST
 
-    def _rays(self, focal: float, exchanged: bool) -> tuple[FloatArray, FloatArray]:
-        """Unit bearings (N, 3) in both cameras, with a factor on the second one's focal length."""
+    def _rays(
+        self, focal: float, exchanged: bool, both: bool = False
+    ) -> tuple[FloatArray, FloatArray]:
+        """Unit bearings (N, 3) in both cameras, with a factor on focal lengths: see `judged`."""
         one, two = (mounted.camera for mounted in self._rig.cameras[:2])
         if exchanged:
             one, two = two, one
         two = replace(two, fx=two.fx * focal, fy=two.fy * focal)
+        if both:
+            one = replace(one, fx=one.fx * focal, fy=one.fy * focal)
         return _bearings(one, self.first), _bearings(two, self.second)
 
     def judged(
-        self, second_T_first: gtsam.Pose3, focal: float = 1.0, exchanged: bool = False
+        self,
+        second_T_first: gtsam.Pose3,
+        focal: float = 1.0,
+        exchanged: bool = False,
+        both: bool = False,
     ) -> tuple[float, float]:
-        """Median epipolar distance in pixels, and share of near points in front of both cameras."""
-        a, b = self._rays(focal, exchanged)
+        """Median epipolar distance in pixels, and share of near points in front of both cameras.
+
+        Args:
+            second_T_first: the relative pose; its length does not matter.
+            focal: factor on the focal length of the second camera.
+            exchanged: whether each camera has the lens of the other.
+            both: whether the factor is on the focal length of the first one, too.
+        """
+        a, b = self._rays(focal, exchanged, both)
         R, t = second_T_first.rotation().matrix(), np.asarray(second_T_first.translation())
         length = float(np.linalg.norm(t))
         if length == 0.0:
@@ -215,11 +235,18 @@ def _cause(
     if fits:
         return min(fits)[1:]
     relative = two.between(one)
-    distances = [pair.judged(relative, float(k))[0] for k in _FOCAL_STEPS]
-    k = int(np.argmin(distances))
-    fitting = distances[k] < _FITS_PX and not _worse(distances[k], best_px)
-    if fitting and abs(_FOCAL_STEPS[k] - 1.0) > 0.02:
-        factor = float(_FOCAL_STEPS[k])
+    factor, distance = _focal_factor(pair, relative, both=False)
+    common, common_px = _focal_factor(pair, relative, both=True)
+    fitting = common_px < min(distance, _SIMPLER * best_px, _FITS_PX)
+    if fitting and abs(common - 1.0) > _FOCAL_STEP:
+        what = f"the focal lengths of both cameras are {1 / common:.2f} times what fits their poses"
+        return (
+            what,
+            f"multiply fx and fy of both by {common:.2f}, or calibrate the lenses again",
+            "",
+        )
+    fitting = distance < _FITS_PX and not _worse(distance, best_px)
+    if fitting and abs(factor - 1.0) > _FOCAL_STEP:
         what = f"the focal length of cam1 is {1 / factor:.2f} times what fits cam0"
         return what, f"multiply fx and fy of cam1 by {factor:.2f}, or calibrate the lens again", ""
     if best is None or best_px > _FITS_PX:
@@ -235,3 +262,14 @@ def _cause(
         f"calibrate again, or try T_cn_cnm1 of cam1: {' '.join(rows.split())}",
         "",
     )
+
+
+def _focal_factor(pair: StereoPair, relative: gtsam.Pose3, both: bool) -> tuple[float, float]:
+    """The factor on the focal length of the second camera or of both that fits best, and how well.
+
+    Returns:
+        The factor, and the median epipolar distance with it, px.
+    """
+    distances = [pair.judged(relative, float(k), both=both)[0] for k in _FOCAL_STEPS]
+    k = int(np.argmin(distances))
+    return float(_FOCAL_STEPS[k]), distances[k]
