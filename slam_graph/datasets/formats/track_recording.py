@@ -282,7 +282,7 @@ class TrackRecordingSequence(RecordedSequence):
         if not self._recalibrated:
             return tuple(cameras)
         seen = []
-        for observed, mounted in zip(cameras, self.rig.cameras, strict=True):
+        for observed, mounted in zip(cameras, self.rig.cameras, strict=False):  # moving: or none
             inside = mounted.camera.visible(observed.pixels)[1]
             seen.append(observed if inside.all() else observed.select(inside))
         lost = sum(map(len, cameras)) - sum(map(len, seen))
