@@ -266,7 +266,8 @@ class TrackRecordingSequence(RecordedSequence):
     ) -> FeatureObservations:
         ids, pixels = (np.ascontiguousarray(rows[name]) for name in ("id", "pixel"))
         if self._recalibrated:
-            normalized = self.rig.cameras[camera].camera.undistort(pixels)
+            with np.errstate(all="ignore"):  # beyond the edge of the lens: left out later
+                normalized = self.rig.cameras[camera].camera.undistort(pixels)
         else:
             normalized = np.ascontiguousarray(rows["normalized"])
         if not (
