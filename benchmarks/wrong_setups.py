@@ -14,7 +14,7 @@ import numpy as np
 from slam_graph.datasets.sequence import FrameStream, ReaderOptions, RecordedSequence, SequenceInfo
 from slam_graph.datasets.streams.imu_stream import clean_blocks
 from slam_graph.geometry import Trajectory
-from slam_graph.sensors import Camera, FeatureFrame, ImuData, Rig, RigCamera
+from slam_graph.sensors import Camera, FeatureFrame, FeatureObservations, ImuData, Rig, RigCamera
 
 Change = Callable[[Rig], Rig]
 
@@ -92,6 +92,12 @@ def _less_noise(rig: Rig) -> Rig:
     return Rig(rig.cameras, replace(imu, **{n: 0.1 * getattr(imu, n) for n in names}))
 
 
+def _seen_by(lens: Camera, seen: FeatureObservations) -> FeatureObservations:
+    """Features as a lens sees them: none beyond its edge."""
+    normalized, inside = lens.visible(seen.pixels)
+    return replace(seen, normalized=normalized).select(inside)
+
+
 def _exchanged(rig: Rig) -> Rig:
     first, second = rig.cameras[:2]
     return Rig((second, first), rig.imu)
@@ -151,12 +157,12 @@ class WronglySetUp(RecordedSequence):
         return self._recording.info()
 
     def frames(self, start_ns: int | None = None, end_ns: int | None = None) -> FrameStream:
-        """The frames; points of tracks are normalised by the wrong lenses."""
+        """The frames; points of tracks are normalised by the wrong lenses, if they see them."""
         for frame in self._recording.frames(start_ns, end_ns):
             if isinstance(frame, FeatureFrame):
                 seen = zip(frame.cameras, self.rig.cameras, strict=True)
-                cameras = [replace(s, normalized=c.camera.undistort(s.pixels)) for s, c in seen]
-                yield FeatureFrame(frame.stamp_ns, tuple(cameras))
+                cameras = tuple(_seen_by(mounted.camera, points) for points, mounted in seen)
+                yield FeatureFrame(frame.stamp_ns, cameras)
             else:
                 yield frame
 

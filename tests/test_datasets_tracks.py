@@ -3,6 +3,7 @@
 """Recorded feature tracks: GTSAM's wheel, OpenVINS' simulation, and our own recordings."""
 
 import tracemalloc
+from dataclasses import replace
 from pathlib import Path
 
 import gtsam
@@ -10,6 +11,7 @@ import numpy as np
 import pytest
 from recordings import edit_line, edit_text, write_euroc, write_lines, write_openvins
 
+from slam_graph.datasets import open_dataset
 from slam_graph.datasets.calibration.euroc_calibration import read_euroc_rig
 from slam_graph.datasets.calibration.kalibr_calibration import write_kalibr
 from slam_graph.datasets.formats.eqvio import EqvioTracks, wheel_tracks
@@ -350,3 +352,27 @@ def test_descriptors_are_replayed_bit_by_bit(tmp_path: Path) -> None:
     file.write_bytes(file.read_bytes()[:-1])
     with pytest.raises(DataError, match="descriptors"):
         TrackRecordingSequence(tmp_path / "recorded")
+
+
+def test_a_recording_is_known_by_its_files_and_its_description_is_named(tmp_path: Path) -> None:
+    folder = tmp_path / "flight"
+    simulate(cameras=1, duration_s=0.5).save(folder)
+    for text, said in (("name: [1\n", r"meta.yaml:\d+: not valid"), ("a: 1\n", "format")):
+        (folder / "meta.yaml").write_text(text)
+        with pytest.raises(DataError, match=said):
+            open_dataset(folder)
+
+
+def test_another_lens_does_not_see_everything(tmp_path: Path) -> None:
+    """What is beyond its edge is left out and counted."""
+    flight = simulate(cameras=1, duration_s=0.5)
+    flight.save(tmp_path / "flight")
+    mounted = flight.rig.cameras[0]
+    lens = replace(mounted.camera, fx=120.0, fy=120.0, distortion="equidistant")
+    lens = replace(lens, coefficients=(0.0, 0.0, 0.0, 0.0))
+    write_kalibr(Rig((replace(mounted, camera=lens),), flight.rig.imu), tmp_path / "wide.yaml")
+    recording = open_dataset(tmp_path / "flight", calibration=tmp_path / "wide.yaml")
+    seen = [f.cameras[0] for f in recording.frames() if isinstance(f, FeatureFrame)]
+    assert all(np.isfinite(c.normalized).all() for c in seen)
+    assert recording.diagnostics.counts["feature_outside_lens"] > 0
+    assert sum(map(len, seen)) > 0

@@ -20,8 +20,11 @@ from slam_graph.datasets.faults.injection import inject
 from slam_graph.datasets.memory_sequence import dataset_from_arrays
 from slam_graph.datasets.sequence import RecordedSequence
 from slam_graph.diagnosis import Diagnosis
-from slam_graph.diagnosis.finding import Finding
+from slam_graph.diagnosis.finding import Finding, no_surer
 from slam_graph.diagnosis.gathering import Part, uninterrupted
+from slam_graph.diagnosis.imu_checks import check_units
+from slam_graph.diagnosis.stereo_geometry import check_stereo
+from slam_graph.diagnosis.stereo_matching import StereoMatches
 from slam_graph.sensors.measurements import FeatureFrame, ImuData
 from slam_graph.sensors.rig import Rig, RigCamera
 
@@ -126,6 +129,42 @@ def test_forces_without_gravity(real_tracks: Recorded) -> None:
     first(Diagnosis.of_tracks(rig, frames, linear), "accelerometer_gravity")
 
 
+def test_sensors_that_always_measure_the_same(real_tracks: Recorded) -> None:
+    rig, frames, imu = real_tracks
+    first(judged(real_tracks, gyro=np.zeros((3, 3))), "gyroscope_constant")
+    diagnosis = Diagnosis.nearby(rig, frames, ImuData(imu.stamps_ns, 0.0 * imu.gyro, imu.accel))
+    first(diagnosis, "gyroscope_constant")
+    stuck = np.repeat(imu.accel[:1], len(imu), axis=0)
+    diagnosis = Diagnosis.of_tracks(rig, frames, ImuData(imu.stamps_ns, imu.gyro, stuck))
+    first(diagnosis, "accelerometer_constant")
+
+
+def test_scale_of_the_gyroscope_is_not_taken_for_a_turn(stereo_tracks: Recorded) -> None:
+    diagnosis = judged(stereo_tracks, gyro=1.1 * np.eye(3))
+    assert first(diagnosis, "gyroscope_scale")["factor"] == pytest.approx(1.1, rel=0.02)
+    assert len(diagnosis.faults) == 1
+
+
+@pytest.mark.parametrize(
+    ("unit", "force", "said"),
+    [(9.80665e-3, 9.81, "is mg"), (1e-2, 9.81, "is cm/s²"), (1e-2, 9.90, "is cm/s² or mg")],
+)
+def test_units_that_differ_by_two_percent(unit: float, force: float, said: str) -> None:
+    """They are told apart where the force is that of gravity, and both are named in between."""
+    stamps_ns = np.arange(2000, dtype=np.int64) * 5_000_000
+    measured = np.random.default_rng(1).normal([0.0, 0.0, force], 0.05, (2000, 3))
+    found, factor = check_units(ImuData(stamps_ns, 0.0 * measured, measured / unit))
+    assert found[0].what.endswith(said)
+    assert factor == pytest.approx(unit, rel=0.02)
+
+
+def test_a_fault_is_no_surer_than_those_before() -> None:
+    faults = [Finding("a", "error", "", sure="likely"), Finding("b", "info", "", sure="hint")]
+    assert no_surer(Finding("c", "error", ""), faults).sure == "likely"
+    assert no_surer(Finding("c", "info", ""), faults).sure == "certain"
+    assert no_surer(Finding("c", "error", "", sure="hint"), faults).sure == "hint"
+
+
 def test_rates_in_degrees(real_tracks: Recorded) -> None:
     values = first(judged(real_tracks, gyro=np.rad2deg(1.0) * np.eye(3)), "gyroscope_unit")
     assert values["factor"] == pytest.approx(57.3, rel=0.1)
@@ -222,6 +261,22 @@ def test_stereo_geometry(stereo_tracks: Recorded, change: Poses, said: str) -> N
     diagnosis = judged(stereo_tracks, posed(stereo_tracks[0], change))
     first(diagnosis, "stereo_geometry")
     assert said in diagnosis.best_guess()
+
+
+def test_exchanged_cameras_explain_a_mounting(stereo_tracks: Recorded) -> None:
+    """The first camera in the place of the second one is one fault, and no turn beside it."""
+    rig = Rig(stereo_tracks[0].cameras[::-1], stereo_tracks[0].imu)
+    diagnosis = judged(stereo_tracks, rig)
+    first(diagnosis, "stereo_geometry")
+    assert "exchange" in diagnosis.best_guess()
+    assert [finding.kind for finding in diagnosis.faults] == ["stereo_geometry"]
+
+
+def test_both_focal_lengths_without_a_gyroscope(stereo_tracks: Recorded) -> None:
+    rig, frames, _ = stereo_tracks
+    matches = [StereoMatches.of_tracks(frame) for frame in frames[::30]]
+    found = check_stereo(matches, changed(rig, lambda c: magnified(c, 1.3)))
+    assert "focal lengths of both cameras are 1.2" in found[0].what  # they are known to a tenth
 
 
 def test_focal_length_of_the_second_camera(stereo_tracks: Recorded) -> None:

@@ -17,6 +17,7 @@ from slam_graph.arrays import GrowingTable
 from slam_graph.backend import Estimator
 from slam_graph.backend.cost.gating import Innovations
 from slam_graph.backend.engine_protocol import StepReport
+from slam_graph.cli.options import write_result
 from slam_graph.config import load_config
 from slam_graph.datasets.groundtruth import read_groundtruth
 from slam_graph.datasets.sequence import SequenceInfo
@@ -86,6 +87,17 @@ def test_a_run_that_fails_leaves_what_it_has_written_and_no_link(tmp_path: Path)
         fail("a.txt")
     (folder,) = (tmp_path / "data").iterdir()
     assert [file.name for file in folder.iterdir()] == ["a.txt"]
+
+
+def test_a_result_that_cannot_be_written_leaves_nothing(tmp_path: Path) -> None:
+    class Partial:
+        def save(self, folder: Path) -> list[Path]:
+            (folder / "config.yaml").write_text("")
+            raise DataError("disk full")
+
+    with pytest.raises(DataError, match="disk full"):
+        write_result(Partial(), "data", tmp_path, [])  # type: ignore[arg-type, type-var]
+    assert not (tmp_path / "data").exists()
 
 
 def test_a_real_folder_called_latest_is_left_alone(tmp_path: Path) -> None:

@@ -345,13 +345,17 @@ def read_policy(
 def write_result(
     result: _Result, name: str, output: Path, log: list[str]
 ) -> tuple[Path, list[Path]]:
-    """Write all files into a new folder, named after the problem."""
+    """Write all files into a new folder, named after the problem, or nothing if that fails."""
     from slam_graph.results import ResultFolder
 
     with Interrupts.completed() as begin, ResultFolder.of_run(output, name) as made:
         begin()
-        made.files += result.save(made.folder)
-        made.text("run.log", log)
+        try:
+            made.files += result.save(made.folder)
+            made.text("run.log", log)
+        except BaseException:
+            made.discard()  # a part of the files would look like a result
+            raise
     return made.folder, made.files
 
 

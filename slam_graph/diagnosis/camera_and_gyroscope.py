@@ -15,12 +15,22 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from slam_graph.arrays import FloatArray
+from slam_graph.diagnosis.constant_sensors import (
+    anything_constant,
+    check_accelerometer,
+    check_gyroscope,
+)
 from slam_graph.diagnosis.finding import Finding, graded
 from slam_graph.diagnosis.frame_pairs import FramePair, frame_pairs
 from slam_graph.diagnosis.gathering import Part
 from slam_graph.diagnosis.gyroscope import Gyroscope
 from slam_graph.diagnosis.mountings import Explanation, axes_text, explained
-from slam_graph.diagnosis.rotation_fit import UNKNOWNS, Kinematics, RotationFit, RotationProblem
+from slam_graph.diagnosis.rotation_fit import (
+    WITH_SCALE,
+    Kinematics,
+    RotationFit,
+    RotationProblem,
+)
 from slam_graph.diagnosis.turning import Turning, coarse_turning
 from slam_graph.sensors import ImuData, Rig, RigCamera
 
@@ -30,6 +40,7 @@ _DEGREES = 57.29578
 _RATE_UNITS = {
     "degrees/s": _DEGREES,
     "mrad/s": 1e3,
+    "revolutions/min": 30.0 / np.pi,
     "rad/s where degrees/s were expected": 1 / _DEGREES,
 }
 _UNIT_RATIO = 1.5
@@ -47,14 +58,25 @@ _OFFSET_S, BAD_OFFSET_S = 5e-3, 1.5e-2
 _FOCAL, _BAD_FOCAL = 0.02, 0.025
 _TURN_RAD, _BAD_TURN_RAD = np.deg2rad(1.2), np.deg2rad(1.5)
 _READOUT_S = 8e-3
+_SCALE, _BAD_SCALE = 0.02, 0.025
+_KNOWN_OFFSET_S, _KNOWN_FOCAL = 1e-2, 0.05
+"""Camera and gyroscope agree only if clocks and focal length are known so well."""
+_LIKE_PRINCIPAL_POINT_RAD = np.deg2rad(5.0)
+_LIKE_PRINCIPAL_POINT, _BAD_FIT_PX = 0.1, 1.5
+"""A wrong principal point looks like a turn of the camera that is smaller than this, and like such
+a change of the focal length; wrong distortion leaves residuals."""
 _NAMED_RAD = np.deg2rad(4.0)
 """So near a named explanation must come to a mounting that was found."""
 FEWEST_PAIRS = 10
 CLEARLY = 1.05
 """The noise of one fit is clearly larger than that of another by this factor."""
-_FOCAL_STARTS = (1.0, 0.77, 1.3)
-_GOOD_PX = 1.5
-"""A fit with this noise needs no other start."""
+_FOCAL_STARTS = np.geomspace(0.7, 1.45, 9)
+"""Factors on the focal length with which a fit is compared, as it may be in a wrong minimum."""
+_SAME_MINIMUM = 0.06
+"""Logarithms of focal lengths that are so near lead to the same minimum."""
+_CLEARLY_BETTER = 0.9
+"""Noise of another minimum as a part of that of the first one, if it is taken."""
+_NOT_JUDGED = "principal point and distortion are not judged, and wrong ones can look like this"
 
 
 @dataclass(eq=False)
@@ -67,6 +89,8 @@ class CameraAndGyroscope:
         gyroscopes: of the parts.
         findings: so far.
         fit: of clock, mounting, focal length and bias; None if the camera turns too little.
+        scale_sigma: standard deviation of the gyroscope's scale, if it was asked for: where it is
+            large, nothing tells a factor on the focal length from one on the angular rates.
     """
 
     rig: Rig
@@ -74,6 +98,12 @@ class CameraAndGyroscope:
     gyroscopes: list[Gyroscope]
     findings: list[Finding] = field(default_factory=list)
     fit: RotationFit | None = None
+    scale_sigma: float = 0.0
+
+    @property
+    def has_constant_sensor(self) -> bool:
+        """Whether gyroscope or accelerometer say nothing."""
+        return any(finding.kind.endswith("_constant") for finding in self.findings)
 
 
 def compare(rig: Rig, parts: list[Part]) -> CameraAndGyroscope:
@@ -87,6 +117,12 @@ def compare(rig: Rig, parts: list[Part]) -> CameraAndGyroscope:
     camera = rig.cameras[0]
     pairs = frame_pairs(now.parts, now.gyroscopes, camera)
     turning = _turning(now, pairs)
+    R = camera.body_T_camera.rotation().matrix()
+    found = check_gyroscope(now.parts, pairs, R) if turning is not None else []
+    found += check_accelerometer(now.parts, now.gyroscopes, turning is not None)
+    now.findings += found
+    if any(finding.kind == "gyroscope_constant" for finding in found):
+        return now
     if turning is None or len(pairs) < FEWEST_PAIRS:
         text = "the camera turns too little to check clock, mounting and focal length"
         now.findings.append(Finding("turns_too_little", "info", text, "record livelier motion"))
@@ -103,6 +139,7 @@ def compare(rig: Rig, parts: list[Part]) -> CameraAndGyroscope:
         now.findings.append(Finding("not_alike", "warning", what, fix, "likely"))
         return now
     if not _calibration_is_better(problem, _calibrated(camera), now.fit):
+        _judge_scale(now, problem, now.fit)
         _judge(now, now.fit)
     return now
 
@@ -112,6 +149,8 @@ def refine(rig: Rig, parts: list[Part]) -> CameraAndGyroscope:
 
     Unit and axes of the gyroscope are taken as they are, and the fit starts as calibrated.
     """
+    if anything_constant(parts):
+        return compare(rig, parts)
     now = CameraAndGyroscope(rig, parts, [Gyroscope(part.imu) for part in parts])
     camera = rig.cameras[0]
     pairs = frame_pairs(now.parts, now.gyroscopes, camera, turns=False)
@@ -170,15 +209,15 @@ def _unit(now: CameraAndGyroscope, pairs: list[FramePair], turning: Turning) -> 
     if same or factor <= 0.0 or turning.misfit > _FITS:
         return turning
     what = f"the gyroscope turns {factor:.3g} times as fast as the camera"
-    fix = f"divide the angular rates by {factor:.4g} to have rad/s"
+    fix, named = f"divide the angular rates by {factor:.4g} to have rad/s", ""
     for unit, ratio in _RATE_UNITS.items():
         if 1 / _UNIT_RATIO < factor / ratio < _UNIT_RATIO:
             what, fix = (
                 f"{what}: its unit is {unit}",
                 f"multiply the angular rates by {1 / ratio:g}",
             )
-            factor = ratio
-    values = {"factor": turning.factor}
+            factor, named = ratio, unit
+    values = {"factor": turning.factor, "unit": named}
     sigmas = 1.0 / max(turning.misfit, 1e-3) * np.sqrt(len(pairs))
     now.findings.append(Finding.measured("gyroscope_unit", "error", what, fix, sigmas, values))
     _replace_imu(now, np.eye(3) / factor)
@@ -222,23 +261,72 @@ def _calibrated(camera: RigCamera) -> Kinematics:
 
 
 def _solved(problem: RotationProblem, start: Kinematics) -> RotationFit | None:
-    """The best fit from several focal lengths."""
+    """The best fit, also from the focal length that fits the start best.
+
+    The tracks of a few seconds may fit a wrong focal length well, with a turn of the camera that
+    makes up for it.
+    """
     best: RotationFit | None = None
-    for focal in _FOCAL_STARTS:
-        try:
-            fit = problem.solve(replace(start, focal=focal))
-        except np.linalg.LinAlgError:
-            continue
-        if best is None or fit.noise_px < 0.9 * best.noise_px:
+    with suppress(np.linalg.LinAlgError):
+        best = problem.solve(start)
+    others = [replace(start, focal=float(focal)) for focal in _FOCAL_STARTS]
+    other = min(others, key=problem.noise_px)
+    if best is not None and abs(np.log(other.focal / best.values.focal)) < _SAME_MINIMUM:
+        return best
+    with suppress(np.linalg.LinAlgError):
+        fit = problem.solve(other)
+        if best is None or fit.noise_px < _CLEARLY_BETTER * best.noise_px:
             best = fit
-        if best.noise_px < _GOOD_PX:
-            break
     return best
+
+
+def _judge_scale(now: CameraAndGyroscope, problem: RotationProblem, fit: RotationFit) -> None:
+    """Whether the gyroscope has another scale.
+
+    For turns about the axes of the image a factor on the rates is like one on the focal length, and
+    not for turns about the optical axis or at the edge of the image. What is found is corrected.
+    """
+    try:
+        wider = problem.solve(fit.values, WITH_SCALE)
+    except np.linalg.LinAlgError:
+        return
+    scale, sigma = wider.values.scale, float(wider.sigmas[WITH_SCALE.index("scale")])
+    now.scale_sigma = sigma
+    change = abs(float(np.log(scale)))
+    if change < max(_SCALE * _noisier(wider), SIGMAS * sigma) or wider.noise_px > fit.noise_px:
+        return
+    coarse = _withdrawn_unit(now)  # where a wrong lens has made it of another unit at first
+    now.fit = replace(
+        wider, values=replace(wider.values, bias=wider.values.bias / scale, scale=1.0)
+    )
+    _replace_imu(now, np.eye(3) / scale)
+    scale *= coarse
+    change = abs(float(np.log(scale)))
+    if change < max(_SCALE * _noisier(wider), SIGMAS * sigma):
+        return
+    what = (
+        f"the gyroscope turns {scale:.3f} ± {sigma:.3f} times as fast as the camera, about all "
+        "axes: its scale is wrong"
+    )
+    fix = f"divide the angular rates by {scale:.4f}, and check the gyroscope's range setting"
+    severity, values = graded(change > _BAD_SCALE), {"factor": scale, "sigma": sigma}
+    now.findings.append(
+        Finding.measured("gyroscope_scale", severity, what, fix, change / sigma, values)
+    )
+
+
+def _withdrawn_unit(now: CameraAndGyroscope) -> float:
+    """The factor of a finding of a gyroscope's unit without a name, which is taken back; else 1."""
+    for finding in now.findings:
+        if finding.kind == "gyroscope_unit" and not finding.values["unit"]:
+            now.findings.remove(finding)
+            return float(str(finding.values["factor"]))
+    return 1.0
 
 
 def _judge(now: CameraAndGyroscope, fit: RotationFit) -> None:
     """Findings of a fit; what is wrong is corrected in the rig."""
-    sigma = dict(zip(UNKNOWNS, fit.sigmas.tolist(), strict=True))
+    sigma = dict(zip(WITH_SCALE, fit.sigmas.tolist(), strict=True))
     before = len(now.findings)
     _judge_mounting(now, fit)
     _judge_readout(now, fit, sigma["readout"])
@@ -246,13 +334,14 @@ def _judge(now: CameraAndGyroscope, fit: RotationFit) -> None:
     change_s = fit.values.offset_s - camera.clock_offset_s
     if abs(change_s) > max(_OFFSET_S * _noisier(fit), SIGMAS * sigma["offset"]):
         value = camera.time_offset_s + change_s
+        shown = round(value, 4) + 0.0  # without a negative zero
         what = (
-            f"the clocks of camera and IMU differ by {1e3 * value:.1f} ± "
+            f"the clocks of camera and IMU differ by {1e3 * shown:.1f} ± "
             f"{1e3 * sigma['offset']:.1f} ms, "
             f"and the calibration says {1e3 * camera.time_offset_s:.1f} ms"
         )
         fix = (
-            f"timeshift_cam_imu: {value:.4f} in the calibration, or "
+            f"timeshift_cam_imu: {shown:.4f} in the calibration, or "
             "--set backend.calibration.time_offset=true"
         )
         severity = graded(abs(change_s) > BAD_OFFSET_S)
@@ -269,23 +358,29 @@ def _judge(now: CameraAndGyroscope, fit: RotationFit) -> None:
         )
     _judge_focal(now, fit, sigma["focal"])
     if len(now.findings) == before:
-        text = (
-            "camera and gyroscope agree: clocks differ by "
-            f"{1e3 * change_s:.1f} ± {1e3 * sigma['offset']:.1f} ms, the focal length by "
-            f"{fit.values.focal - 1:.1%} ± {sigma['focal']:.1%}; epipolar distances are "
-            f"{fit.noise_px:.2f} px"
-        )
-        now.findings.append(Finding("camera_and_gyroscope", "info", text))
+        now.findings.append(_agreement(fit, change_s, sigma))
+
+
+def _agreement(fit: RotationFit, change_s: float, sigma: dict[str, float]) -> Finding:
+    """That nothing is wrong, or that too little is known to say so."""
+    figures = (
+        f"clocks differ by {round(1e3 * change_s, 1) + 0.0:.1f} ± {1e3 * sigma['offset']:.1f} ms, "
+        f"the focal length by {fit.values.focal - 1:.1%} ± {sigma['focal']:.1%}; "
+        f"epipolar distances are {fit.noise_px:.2f} px"
+    )
+    if sigma["offset"] < _KNOWN_OFFSET_S and sigma["focal"] < _KNOWN_FOCAL:
+        text = f"camera and gyroscope agree: {figures}"
+        return Finding("camera_and_gyroscope", "info", text)
+    text = f"the camera turns too little to say whether it agrees with the gyroscope: {figures}"
+    return Finding("turns_too_little", "info", text, "record livelier motion")
 
 
 def _judge_mounting(now: CameraAndGyroscope, fit: RotationFit) -> None:
     """Whether the calibrated rotation is wrong; it is corrected then."""
-    R = now.rig.cameras[0].body_T_camera.rotation().matrix()
-    turn, covariance = fit.turn_from(R)
-    away = float(np.linalg.norm(turn))
-    sigmas = float(np.sqrt(turn @ np.linalg.solve(covariance, turn)))
-    if away < _TURN_RAD * _noisier(fit) or sigmas < SIGMAS:
+    if not _is_turned(now, fit):
         return
+    R = now.rig.cameras[0].body_T_camera.rotation().matrix()
+    away, sigmas = _turn(now, fit)
     sigma = away / sigmas
     named = explained(fit.values.body_R_camera, R)
     if named.away_rad > max(_NAMED_RAD, 3 * sigma) or away < _TURNED_RAD:
@@ -298,6 +393,19 @@ def _judge_mounting(now: CameraAndGyroscope, fit: RotationFit) -> None:
         pose = pose.inverse() if named.kind == "inverse" else by * pose
         cameras.append(replace(mounted, body_T_camera=pose))
     now.rig = replace(now.rig, cameras=tuple(cameras))
+
+
+def _turn(now: CameraAndGyroscope, fit: RotationFit) -> tuple[float, float]:
+    """Angle between the calibrated mounting and the one that was found, rad, and in deviations."""
+    R = now.rig.cameras[0].body_T_camera.rotation().matrix()
+    turn, covariance = fit.turn_from(R)
+    sigmas = float(np.sqrt(turn @ np.linalg.solve(covariance, turn)))
+    return float(np.linalg.norm(turn)), sigmas
+
+
+def _is_turned(now: CameraAndGyroscope, fit: RotationFit) -> bool:
+    away, sigmas = _turn(now, fit)
+    return away >= _TURN_RAD * _noisier(fit) and sigmas >= SIGMAS
 
 
 def _mounting_finding(named: Explanation, R: FloatArray, away: float, sigma: float) -> Finding:
@@ -314,6 +422,8 @@ def _mounting_finding(named: Explanation, R: FloatArray, away: float, sigma: flo
     elif named.kind == "axes":
         what = f"{what}: {named.what}"
         fix = f"write the IMU's (x, y, z) as {axes_text(named.axes)}, or {fix}"
+    elif away < _LIKE_PRINCIPAL_POINT_RAD:
+        fix = f"{fix}; {_NOT_JUDGED}"
     severity = graded(away > _BAD_TURN_RAD)
     return Finding.measured("mounting", severity, what, fix, away / sigma, values)
 
@@ -342,7 +452,7 @@ def _judge_focal(now: CameraAndGyroscope, fit: RotationFit, sigma: float) -> Non
     """Whether the focal length is wrong; that of all cameras is corrected then."""
     factor = fit.values.focal
     change = abs(float(np.log(factor)))
-    if change < max(_FOCAL * _noisier(fit), SIGMAS * sigma):
+    if not _is_magnified(fit):
         return
     camera = now.rig.cameras[0].camera
     what = (
@@ -353,12 +463,22 @@ def _judge_focal(now: CameraAndGyroscope, fit: RotationFit, sigma: float) -> Non
         f"fx: {camera.fx * factor:.1f}, fy: {camera.fy * factor:.1f} of cam0; "
         "or calibrate the lens again"
     )
+    if change < SIGMAS * now.scale_sigma:
+        what = f"{what}; or the gyroscope turns {1 / factor:.3f} times as fast as it should"
+        fix = f"{fix}; or divide the angular rates by {1 / factor:.3f}"
+    if fit.noise_px > _BAD_FIT_PX or change < _LIKE_PRINCIPAL_POINT:
+        fix = f"{fix}; {_NOT_JUDGED}"
     severity = graded(change > _BAD_FOCAL)
     values = {"factor": 1 / factor, "fx": camera.fx * factor}
     now.findings.append(
         Finding.measured("focal_length", severity, what, fix, change / sigma, values)
     )
     now.rig = scaled_lenses(now.rig, factor)
+
+
+def _is_magnified(fit: RotationFit) -> bool:
+    change, sigma = abs(float(np.log(fit.values.focal))), float(fit.sigmas[1])
+    return change >= max(_FOCAL * _noisier(fit), SIGMAS * sigma)
 
 
 def _noisier(fit: RotationFit) -> float:

@@ -9,9 +9,9 @@ from dataclasses import asdict, dataclass
 
 from slam_graph.arrays import FloatArray
 from slam_graph.datasets import RecordedSequence
-from slam_graph.diagnosis.camera_and_gyroscope import compare, refine
+from slam_graph.diagnosis.camera_and_gyroscope import CameraAndGyroscope, compare, refine
 from slam_graph.diagnosis.clock_windows import ClockWindows
-from slam_graph.diagnosis.finding import Finding, in_order
+from slam_graph.diagnosis.finding import Finding, in_order, no_surer
 from slam_graph.diagnosis.frame_checks import check_images, check_stamps, check_tracks
 from slam_graph.diagnosis.gathering import (
     Material,
@@ -25,7 +25,7 @@ from slam_graph.diagnosis.gathering import (
 from slam_graph.diagnosis.imu_checks import check_sampling, check_units
 from slam_graph.diagnosis.motion_checks import check_motion
 from slam_graph.diagnosis.run_evidence import Evidence
-from slam_graph.diagnosis.stereo_geometry import check_stereo
+from slam_graph.diagnosis.stereo_geometry import check_stereo, mended
 from slam_graph.diagnosis.stereo_matching import StereoMatches, match_images
 from slam_graph.geometry import StateHistory
 from slam_graph.sensors import CameraFrame, FeatureFrame, ImuData, Rig
@@ -33,9 +33,12 @@ from slam_graph.sensors import CameraFrame, FeatureFrame, ImuData, Rig
 SETUP_KINDS = (
     "accelerometer_unit",
     "accelerometer_gravity",
+    "accelerometer_constant",
     "accelerometer_sign",
     "accelerometer_axes",
+    "gyroscope_constant",
     "gyroscope_unit",
+    "gyroscope_scale",
     "gyroscope_axes",
     "mounting",
     "time_offset",
@@ -157,7 +160,7 @@ class Diagnosis:
             return Diagnosis(found)
         now = refine(rig, parts)
         found += now.findings + check_stereo(material.stereo, now.rig)
-        if now.fit is not None:
+        if now.fit is not None and not now.has_constant_sensor:
             found += check_motion(now, now.fit, len(rig.cameras) > 1, axes_known=True)
         return Diagnosis(in_order(found))
 
@@ -240,13 +243,36 @@ def _judged(material: Material) -> list[Finding]:
     parts = _enough(material, factor)
     if not parts:
         return found + check_stereo(material.stereo, material.rig)
+    now, stereo, first = _by_cameras(material, parts)
+    found += [*first, *now.findings, *stereo]
+    if now.fit is not None and not now.has_constant_sensor:
+        good = not any(finding.severity == "error" for finding in [*first, *stereo])
+        motion = check_motion(now, now.fit, good and len(material.rig.cameras) > 1)
+        found += [no_surer(finding, now.findings) for finding in motion]
+    return found
+
+
+def _by_cameras(
+    material: Material, parts: list[Part]
+) -> tuple[CameraAndGyroscope, list[Finding], list[Finding]]:
+    """What camera and gyroscope say, what both cameras say, and what explains the former.
+
+    Exchanged cameras look like another mounting of the first one, too: with the cameras as they
+    should be there is none.
+    """
     now = compare(material.rig, parts)
     stereo = check_stereo(material.stereo, now.rig)
-    found += now.findings + stereo
-    if now.fit is not None:
-        good = not any(finding.severity == "error" for finding in stereo)
-        found += check_motion(now, now.fit, good and len(material.rig.cameras) > 1)
-    return found
+    for finding in stereo:
+        rig = mended(material.rig, finding)
+        if rig is not None and _faults(now):
+            right = compare(rig, parts)
+            if right.fit is not None and _faults(right) < _faults(now):
+                return right, [other for other in stereo if other is not finding], [finding]
+    return now, [no_surer(finding, now.findings) for finding in stereo], []
+
+
+def _faults(now: CameraAndGyroscope) -> int:
+    return sum(finding.severity != "info" for finding in now.findings)
 
 
 def _remembered(

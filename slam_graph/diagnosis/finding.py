@@ -4,9 +4,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
-from typing import Literal
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Literal, get_args
 
 Severity = Literal["error", "warning", "info"]
 _SEVERITIES: tuple[Severity, ...] = ("error", "warning", "info")
@@ -67,6 +67,20 @@ def sureness(sigmas: float) -> Sureness:
     if sigmas >= _CERTAIN_SIGMAS:
         return "certain"
     return "likely" if sigmas >= _LIKELY_SIGMAS else "hint"
+
+
+def no_surer(finding: Finding, faults: Iterable[Finding]) -> Finding:
+    """A fault that is no surer than those whose corrections it was found under.
+
+    Args:
+        finding: the later one.
+        faults: the earlier ones; those that are facts have corrected nothing.
+    """
+    if finding.severity == "info":
+        return finding
+    levels: tuple[Sureness, ...] = get_args(Sureness)
+    weakest = [levels.index(fault.sure) for fault in faults if fault.severity != "info"]
+    return replace(finding, sure=levels[max([levels.index(finding.sure), *weakest])])
 
 
 def in_order(findings: list[Finding]) -> list[Finding]:

@@ -11,7 +11,13 @@ from slam_graph.diagnosis.finding import Finding, graded
 from slam_graph.sensors import ImuData, ImuNoise
 
 GRAVITY = 9.81
-_UNITS = {"g": GRAVITY, "mm/s²": 1e-3, "cm/s²": 1e-2, "mg": GRAVITY * 1e-3}
+_STANDARD_G = 9.80665
+_UNITS = {"g": _STANDARD_G, "mm/s²": 1e-3, "cm/s²": 1e-2, "mg": _STANDARD_G * 1e-3}
+_BIAS = 0.05
+"""Standard deviation of an accelerometer's bias along gravity, m/s². It and the scatter of the mean
+force tell units that differ by 2 %, or not:"""
+_CLEARER = 2.0
+"""the next unit must be so many deviations farther from gravity than the nearest one."""
 _ONE_UNIT = (0.75, 1.3)
 """The mean force is that of gravity within these factors: motion adds to it, biases are small."""
 _WINDOW_S = 1.0
@@ -43,17 +49,35 @@ def check_units(imu: ImuData) -> tuple[list[Finding], float]:
         )
         fix = "record the specific force, with gravity (not the driver's linear acceleration)"
         return [Finding("accelerometer_gravity", "error", what, fix, values=values)], 1.0
-    for unit, factor in _UNITS.items():
-        if _fits(force * factor, GRAVITY):
-            what = (
-                f"the accelerometer measures {force:.4g} where gravity is 9.81: its unit is {unit}"
-            )
-            fix = f"multiply the accelerations by {factor:g} to have m/s²"
-            return [Finding("accelerometer_unit", "error", what, fix, values=values)], factor
+    units = _units(force, np.array(means))
+    if units:
+        names, factor = " or ".join(units), units[next(iter(units))]
+        factors = " or ".join(f"{value:g} ({unit})" for unit, value in units.items())
+        what = f"the accelerometer measures {force:.4g} where gravity is 9.81: its unit is {names}"
+        fix = f"multiply the accelerations by {factors} to have m/s²"
+        return [Finding("accelerometer_unit", "error", what, fix, values=values)], factor
     factor = GRAVITY / force
     what = f"the accelerometer measures {force:.4g} where gravity is 9.81 m/s²"
     fix = f"multiply the accelerations by {factor:.4g}, and check the accelerometer's range setting"
     return [Finding("accelerometer_unit", "error", what, fix, values=values)], factor
+
+
+def _units(force: float, means: FloatArray) -> dict[str, float]:
+    """Factors to m/s² of the units that a force may have, the likeliest first.
+
+    Args:
+        force: the median.
+        means: (W,) lengths of the mean forces of seconds, which motion changes little.
+    """
+    fitting = {unit: factor for unit, factor in _UNITS.items() if _fits(force * factor, GRAVITY)}
+    mean = float(np.median(means))
+    spread = 1.4826 * float(np.median(np.abs(means - mean))) * 1.25 / np.sqrt(len(means))
+    away = {
+        unit: abs(mean * factor - GRAVITY) / float(np.hypot(_BIAS, spread * factor))
+        for unit, factor in fitting.items()
+    }
+    units = sorted(fitting, key=lambda unit: away[unit])
+    return {unit: fitting[unit] for unit in units if away[unit] < away[units[0]] + _CLEARER}
 
 
 def _scale(mean: float, values: dict[str, float]) -> list[Finding]:

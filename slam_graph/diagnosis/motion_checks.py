@@ -11,7 +11,7 @@ import numpy as np
 
 from slam_graph.arrays import FloatArray
 from slam_graph.diagnosis.camera_and_gyroscope import CameraAndGyroscope
-from slam_graph.diagnosis.finding import Finding, graded
+from slam_graph.diagnosis.finding import Finding, graded, sureness
 from slam_graph.diagnosis.motion_window import Window, WindowSolution
 from slam_graph.diagnosis.mountings import axes_text, signed_permutations
 from slam_graph.diagnosis.rotation_fit import RotationFit
@@ -37,8 +37,8 @@ _BEHIND = 0.2
 _FITS_PX = 4.0
 """Axes with larger residuals are not believed: something else is wrong, such as features that move.
 """
-_BASELINE, _BAD_BASELINE = 0.12, 0.3
-"""Logarithms of wrong baselines that are a warning, and an error."""
+_BASELINE, _WRONG_BASELINE, _BAD_BASELINE = 0.12, 0.16, 0.3
+"""Logarithms of wrong baselines that are a warning, an error if it is certain, and an error."""
 _BASELINE_SIGMAS = 6.0
 _FEWEST_WINDOWS = 3
 _ROBUST_WINDOWS = 5
@@ -65,7 +65,8 @@ def check_motion(
     windows = _windows(now, fit, rig, _SHORT_S)[:_SHORT_WINDOWS]
     axes, found = np.eye(3), list[Finding]()
     if not axes_known:
-        long = _windows(now, fit, rig, _WINDOW_S)[:_WINDOWS]
+        # features of one camera alone: those of two are triangulated with any axes
+        long = _windows(now, fit, now.rig.select(1), _WINDOW_S)[:_WINDOWS]
         axes, found = _axes(long) if long else (axes, found)
     if not windows:
         text = "too little motion to check the accelerometer's axes and the scale"
@@ -187,5 +188,6 @@ def _baseline(solutions: list[WindowSolution], rig: Rig) -> list[Finding]:
         f"a baseline of {length * factor:.4f} m: multiply the translation of T_cn_cnm1 of cam1 by "
         f"{factor:.3f}"
     )
-    severity = graded(change > _BAD_BASELINE)
+    certain = sureness(change / sigma) == "certain"
+    severity = graded(change > (_WRONG_BASELINE if certain else _BAD_BASELINE))
     return [Finding.measured("baseline", severity, what, fix, change / sigma, values)]

@@ -27,11 +27,14 @@ from slam_graph.diagnosis.gyroscope import Gyroscope
 from slam_graph.sensors import RigCamera
 
 UNKNOWNS = ("offset", "focal", "readout", "rx", "ry", "rz", "bx", "by", "bz")
-_PRIOR = np.array([0.2, 0.5, 0.05, 1.0, 1.0, 1.0, 0.1, 0.1, 0.1])
-"""Prior standard deviations: s, logarithm, s, rad, rad/s."""
-_STEP = np.array([1e-4, 1e-4, 1e-4, 1e-5, 1e-5, 1e-5, 1e-5, 1e-5, 1e-5])
+"""Those that are estimated unless others are asked for."""
+WITH_SCALE = (*UNKNOWNS, "scale")
+"""All of them: the scale of the gyroscope looks much like the focal length."""
+_PRIOR = np.array([0.2, 0.5, 0.05, 1.0, 1.0, 1.0, 0.1, 0.1, 0.1, 0.5])
+"""Prior standard deviations: s, logarithm, s, rad, rad/s, logarithm."""
+_STEP = np.array([1e-4, 1e-4, 1e-4, 1e-5, 1e-5, 1e-5, 1e-5, 1e-5, 1e-5, 1e-4])
 """Steps of the numerical derivatives."""
-_LARGEST = np.array([0.03, 0.1, 0.02, 0.1, 0.1, 0.1, 0.05, 0.05, 0.05])
+_LARGEST = np.array([0.03, 0.1, 0.02, 0.1, 0.1, 0.1, 0.05, 0.05, 0.05, 0.1])
 """Largest change of an unknown in one step."""
 _JUMP = 0.6
 """No epipolar distance changes so much by the largest change of an unknown, in focal lengths."""
@@ -61,6 +64,7 @@ class Kinematics:
         readout_s: of the rows.
         body_R_camera: (3, 3).
         bias: (3,) of the gyroscope, rad/s.
+        scale: factor by which the gyroscope turns faster than the body, after the bias.
     """
 
     offset_s: float
@@ -68,15 +72,17 @@ class Kinematics:
     readout_s: float
     body_R_camera: FloatArray
     bias: FloatArray
+    scale: float = 1.0
 
     def moved(self, by: FloatArray) -> Kinematics:
-        """With a change (9,) in the order of `UNKNOWNS`; the mounting turns in the camera frame."""
+        """With a change (10,) in the order of `WITH_SCALE`; mountings turn in the camera frame."""
         return Kinematics(
             self.offset_s + float(by[0]),
             self.focal * float(np.exp(by[1])),
             self.readout_s + float(by[2]),
             self.body_R_camera @ Rotation.from_rotvec(by[3:6]).as_matrix(),
             self.bias + by[6:9],
+            self.scale * float(np.exp(by[9])),
         )
 
 
@@ -86,7 +92,7 @@ class RotationFit:
 
     Attributes:
         values: of the unknowns.
-        covariance: (9, 9) in the order of `UNKNOWNS`; infinite variances where one is not free.
+        covariance: (10, 10) in the order of `WITH_SCALE`; infinite variances where one is not free.
         noise_px: robust standard deviation of the epipolar distances.
         free: which unknowns were estimated.
     """
@@ -98,7 +104,7 @@ class RotationFit:
 
     @property
     def sigmas(self) -> FloatArray:
-        """(9,) standard deviations in the order of `UNKNOWNS`."""
+        """(10,) standard deviations in the order of `WITH_SCALE`."""
         return np.asarray(np.sqrt(np.diag(self.covariance)), dtype=np.float64)
 
     def turn_from(self, body_R_camera: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -204,7 +210,7 @@ class RotationProblem:
             of = self._part == number
             for k in range(2):
                 R[k, of] = gyroscope.orientation(t[k, of])
-                rates[k, of] = gyroscope.rate_at(t[k, of]) - at.bias
+                rates[k, of] = (gyroscope.rate_at(t[k, of]) - at.bias) / at.scale
         if at.readout_s != 0.0:
             seconds = self._row * at.readout_s
             f = f + np.cross((rates @ C)[:, :, None, :] * seconds[..., None], f)
@@ -213,6 +219,9 @@ class RotationProblem:
         by_bias = (at.bias * (t[1] - t[0])[:, None])[..., None]
         drift = Rotation.from_rotvec(-half).as_matrix() @ by_bias
         body = body @ Rotation.from_rotvec(-drift[..., 0]).as_matrix()
+        if at.scale != 1.0:
+            body = Rotation.from_rotvec(Rotation.from_matrix(body).as_rotvec() / at.scale)
+            body = body.as_matrix()
         camera = C.T @ body @ C
         two = f[1] @ camera.transpose(0, 2, 1)
         return _Turned(f[0], two, slopes[0], camera[:, None] @ slopes[1])
@@ -273,21 +282,22 @@ class RotationProblem:
             precision: steps end where no unknown changes by more than this part of the largest
                 change that it may have.
         """
-        columns = [k for k, name in enumerate(UNKNOWNS) if name in free]
+        columns = [k for k, name in enumerate(WITH_SCALE) if name in free]
         at, noise = start, self.noise_px(start)
         weight = 1.0 / _PRIOR[columns] ** 2
         information = np.zeros((1, len(columns), len(columns)))
         scores = np.zeros((1, len(columns)))
         for _ in range(_MOST_STEPS):
             information, scores = self._normal_equations(at, noise, columns)
-            prior = np.zeros(9)
-            prior[0], prior[6:] = at.offset_s - start.offset_s, at.bias
+            prior = np.zeros(len(WITH_SCALE))
+            prior[0], prior[6:9] = at.offset_s - start.offset_s, at.bias
             prior[1] = np.log(at.focal / start.focal)
             prior[2] = at.readout_s - start.readout_s
+            prior[9] = np.log(at.scale / start.scale)
             gradient = scores.sum(axis=0) + weight * prior[columns]
             step = -np.linalg.solve(information.sum(axis=0) + np.diag(weight), gradient)
             step *= min(1.0, float(np.min(_LARGEST[columns] / np.maximum(np.abs(step), 1e-12))))
-            change = np.zeros(9)
+            change = np.zeros(len(WITH_SCALE))
             change[columns] = step
             tried = at.moved(change)
             lower = self.noise_px(tried)
@@ -298,7 +308,7 @@ class RotationProblem:
             at, noise = tried, lower
             if np.all(np.abs(change) < precision * _LARGEST):
                 break
-        covariance = np.diag(np.full(9, np.inf))
+        covariance = np.diag(np.full(len(WITH_SCALE), np.inf))
         covariance[np.ix_(columns, columns)] = _covariance(information, scores, np.diag(weight))
         return RotationFit(at, covariance, noise, free)
 
@@ -310,7 +320,7 @@ class RotationProblem:
         e, by_t = self.residuals(at, t)
         J, known = np.empty((*e.shape, len(columns))), self.bearings(at.focal)[2]
         for c, k in enumerate(columns):
-            change = np.zeros(9)
+            change = np.zeros(len(WITH_SCALE))
             change[k] = _STEP[k]
             J[..., c] = (self.distances(at.moved(change), t) - e) / _STEP[k]
         # beyond the edge of a wide lens there is no bearing, so that a distance jumps in a step

@@ -22,12 +22,19 @@ _RANSAC_PX, _CONFIDENCE = 1.0, 0.9999
 _WORSE, _WORSE_PX = 2.0, 0.8
 """A calibration is wrong if its epipolar distances are so many times those of the best geometry,
 and so much larger."""
+_FITS_PX = 2.5
+"""No cause is named that leaves larger epipolar distances than this."""
+_SIMPLER = 1.3
+"""A factor on both focal lengths is likelier than another pose, with five unknowns, up to so many
+times its epipolar distances."""
 _AHEAD = 0.75
 """At least so many of the near points must be in front of both cameras."""
 _NEAR_PX = 3.0
 """Near points have at least this parallax."""
 _BASELINES_M = (0.004, 4.0)
 """Shortest and longest baseline that is plausible."""
+_FOCAL_STEP = 0.02
+"""Least change of a focal length that is named."""
 _FOCAL_STEPS = np.linspace(0.7, 1.45, 76)
 
 
@@ -47,19 +54,34 @@ class StereoPair:
         """Whether there are enough matches to judge."""
         return len(self.first) >= _FEWEST
 
-    def _rays(self, focal: float, exchanged: bool) -> tuple[FloatArray, FloatArray]:
-        """Unit bearings (N, 3) in both cameras, with a factor on the second one's focal length."""
+    def _rays(
+        self, focal: float, exchanged: bool, both: bool = False
+    ) -> tuple[FloatArray, FloatArray]:
+        """Unit bearings (N, 3) in both cameras, with a factor on focal lengths: see `judged`."""
         one, two = (mounted.camera for mounted in self._rig.cameras[:2])
         if exchanged:
             one, two = two, one
         two = replace(two, fx=two.fx * focal, fy=two.fy * focal)
+        if both:
+            one = replace(one, fx=one.fx * focal, fy=one.fy * focal)
         return _bearings(one, self.first), _bearings(two, self.second)
 
     def judged(
-        self, second_T_first: gtsam.Pose3, focal: float = 1.0, exchanged: bool = False
+        self,
+        second_T_first: gtsam.Pose3,
+        focal: float = 1.0,
+        exchanged: bool = False,
+        both: bool = False,
     ) -> tuple[float, float]:
-        """Median epipolar distance in pixels, and share of near points in front of both cameras."""
-        a, b = self._rays(focal, exchanged)
+        """Median epipolar distance in pixels, and share of near points in front of both cameras.
+
+        Args:
+            second_T_first: the relative pose; its length does not matter.
+            focal: factor on the focal length of the second camera.
+            exchanged: whether each camera has the lens of the other.
+            both: whether the factor is on the focal length of the first one, too.
+        """
+        a, b = self._rays(focal, exchanged, both)
         R, t = second_T_first.rotation().matrix(), np.asarray(second_T_first.translation())
         length = float(np.linalg.norm(t))
         if length == 0.0:
@@ -105,7 +127,10 @@ def _bearings(camera: Camera, pixels: FloatArray) -> FloatArray:
 
 
 def check_stereo(matches: list[StereoMatches], rig: Rig) -> list[Finding]:
-    """Findings about the first two cameras; nothing without enough matches."""
+    """Findings about the first two cameras; nothing without enough matches.
+
+    A finding of exchanged cameras has a value ``exchanged``: what of them, see `mended`.
+    """
     if len(rig.cameras) < 2:
         return []
     pair = StereoPair(matches, rig)
@@ -136,8 +161,26 @@ def check_stereo(matches: list[StereoMatches], rig: Rig) -> list[Finding]:
     bad = f"matches between the cameras are {distance_px:.2f} px from their epipolar lines"
     if ahead < _AHEAD:
         bad = f"{bad}, and {1 - ahead:.0%} of the near points would be behind a camera"
-    what, fix = _cause(pair, one, two, best, best_px)
-    return [*found, Finding("stereo_geometry", "error", f"{what}: {bad}", fix, values=values)]
+    what, fix, exchanged = _cause(pair, one, two, best, best_px)
+    told = {**values, "exchanged": exchanged}
+    return [*found, Finding("stereo_geometry", "error", f"{what}: {bad}", fix, values=told)]
+
+
+def mended(rig: Rig, finding: Finding) -> Rig | None:
+    """The rig with the first two cameras as they were before they were exchanged.
+
+    Returns:
+        None if the finding is not of exchanged cameras.
+    """
+    one, two = rig.cameras[:2]
+    exchanged = finding.values.get("exchanged")
+    if exchanged == "cameras":
+        return replace(rig, cameras=(two, one, *rig.cameras[2:]))
+    if exchanged == "poses":
+        first = replace(one, body_T_camera=two.body_T_camera)
+        second = replace(two, body_T_camera=one.body_T_camera)
+        return replace(rig, cameras=(first, second, *rig.cameras[2:]))
+    return None
 
 
 def _worse(distance_px: float, best_px: float) -> bool:
@@ -150,57 +193,65 @@ def _cause(
     two: gtsam.Pose3,
     best: gtsam.Pose3 | None,
     best_px: float,
-) -> tuple[str, str]:
-    """What explains the matches, and the line to change."""
+) -> tuple[str, str, str]:
+    """What explains the matches, the line to change, and what is exchanged, if anything is."""
     named = (
         (
             "the cameras are exchanged, images and intrinsics",
             "exchange cam0 and cam1 in the calibration, or their topics or folders",
             one.between(two),
-            True,
+            "cameras",
         ),
         (
             "the poses of the cameras are exchanged",
             "exchange T_cam_imu (T_BS) of cam0 and cam1, or invert T_cn_cnm1",
             one.between(two),
-            False,
+            "poses",
         ),
         (
             "the pose of cam1 is inverted",
             "invert T_cam_imu (T_BS) of cam1",
             two.inverse().between(one),
-            False,
+            "",
         ),
         (
             "the pose of cam0 is inverted",
             "invert T_cam_imu (T_BS) of cam0",
             two.between(one.inverse()),
-            False,
+            "",
         ),
         (
             "the poses of both cameras are inverted",
             "invert T_cam_imu (T_BS) of all cameras",
             two.inverse().between(one.inverse()),
-            False,
+            "",
         ),
     )
     fits = []
     for what, fix, relative, exchanged in named:
-        distance, ahead = pair.judged(relative, exchanged=exchanged)
-        if ahead >= _AHEAD and not _worse(distance, best_px):
-            fits.append((distance, what, fix))
+        distance, ahead = pair.judged(relative, exchanged=exchanged == "cameras")
+        if ahead >= _AHEAD and distance < _FITS_PX and not _worse(distance, best_px):
+            fits.append((distance, what, fix, exchanged))
     if fits:
-        _, what, fix = min(fits)
-        return what, fix
+        return min(fits)[1:]
     relative = two.between(one)
-    distances = [pair.judged(relative, float(k))[0] for k in _FOCAL_STEPS]
-    k = int(np.argmin(distances))
-    if not _worse(distances[k], best_px) and abs(_FOCAL_STEPS[k] - 1.0) > 0.02:
-        factor = float(_FOCAL_STEPS[k])
+    factor, distance = _focal_factor(pair, relative, both=False)
+    common, common_px = _focal_factor(pair, relative, both=True)
+    fitting = common_px < min(distance, _SIMPLER * best_px, _FITS_PX)
+    if fitting and abs(common - 1.0) > _FOCAL_STEP:
+        what = f"the focal lengths of both cameras are {1 / common:.2f} times what fits their poses"
+        return (
+            what,
+            f"multiply fx and fy of both by {common:.2f}, or calibrate the lenses again",
+            "",
+        )
+    fitting = distance < _FITS_PX and not _worse(distance, best_px)
+    if fitting and abs(factor - 1.0) > _FOCAL_STEP:
         what = f"the focal length of cam1 is {1 / factor:.2f} times what fits cam0"
-        return what, f"multiply fx and fy of cam1 by {factor:.2f}, or calibrate the lens again"
-    if best is None:
-        return "no geometry fits the matches", "calibrate the cameras again"
+        return what, f"multiply fx and fy of cam1 by {factor:.2f}, or calibrate the lens again", ""
+    if best is None or best_px > _FITS_PX:
+        what = "no pose between the cameras fits the matches, so that a lens is wrong"
+        return what, "calibrate the cameras again, lenses first", ""
     turn = (best.rotation().inverse() * relative.rotation()).matrix()
     degrees = np.rad2deg(Rotation.from_matrix(turn).magnitude())
     b, length = best.matrix().copy(), float(np.linalg.norm(relative.translation()))
@@ -209,4 +260,16 @@ def _cause(
     return (
         f"the pose between the cameras is off by {degrees:.1f}°",
         f"calibrate again, or try T_cn_cnm1 of cam1: {' '.join(rows.split())}",
+        "",
     )
+
+
+def _focal_factor(pair: StereoPair, relative: gtsam.Pose3, both: bool) -> tuple[float, float]:
+    """The factor on the focal length of the second camera or of both that fits best, and how well.
+
+    Returns:
+        The factor, and the median epipolar distance with it, px.
+    """
+    distances = [pair.judged(relative, float(k), both=both)[0] for k in _FOCAL_STEPS]
+    k = int(np.argmin(distances))
+    return float(_FOCAL_STEPS[k]), distances[k]

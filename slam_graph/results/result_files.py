@@ -9,6 +9,7 @@ import json
 import math
 import os
 import re
+import shutil
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from datetime import UTC, datetime
@@ -132,6 +133,10 @@ class ResultFolder:
                 if empty.is_dir() and not any(empty.iterdir()):
                     empty.rmdir()
             raise
+
+    def discard(self) -> None:
+        """Remove the folder with all that was written into it."""
+        shutil.rmtree(self.folder, ignore_errors=True)
 
     def path(self, name: str) -> Path:
         """The path of the next file, for a writer that makes it appear whole."""

@@ -31,7 +31,7 @@ writes recordings. All numbers are little-endian, and no file is a pickle:
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from functools import cached_property, partial
@@ -97,9 +97,11 @@ def _whole(value: YamlValue, least: int = 0, most: int = 2**53) -> int:
 
 
 def is_recording(path: Path) -> bool:
-    """Whether a folder is one that `TrackRecorder` wrote."""
+    """Whether a folder is one that `TrackRecorder` wrote, its ``meta.yaml`` readable or not."""
     meta = path / META
-    return meta.is_file() and FORMAT_NAME in meta.read_text(errors="replace")[:200]
+    if not meta.is_file():
+        return False
+    return (path / FEATURES).is_file() or FORMAT_NAME in meta.read_text(errors="replace")[:200]
 
 
 class TrackRecordingSequence(RecordedSequence):
@@ -121,6 +123,9 @@ class TrackRecordingSequence(RecordedSequence):
         options = options or ReaderOptions()
         self.path = path
         meta = read_yaml(path / META)
+        kind = meta.require("format")
+        if kind.text() != FORMAT_NAME:
+            raise DataError(f"{kind.where}: expected {FORMAT_NAME}, got {kind.text()[:20]}")
         version = meta.require("version")
         if version.text() != str(FORMAT_VERSION):
             raise DataError(
@@ -245,7 +250,11 @@ class TrackRecordingSequence(RecordedSequence):
                         self._objects.moving(number, len(observed))
                     )
                 )
-                yield FeatureFrame(int(row["stamp"]), tuple(observed), moving=moving)
+                yield FeatureFrame(
+                    int(row["stamp"]),
+                    self._seen_by_lenses(observed),
+                    moving=self._seen_by_lenses(moving),
+                )
 
     def initial_state(self) -> NavState | None:
         """The state at the start, if one was recorded."""
@@ -257,12 +266,30 @@ class TrackRecordingSequence(RecordedSequence):
     ) -> FeatureObservations:
         ids, pixels = (np.ascontiguousarray(rows[name]) for name in ("id", "pixel"))
         if self._recalibrated:
-            normalized = self.rig.cameras[camera].camera.undistort(pixels)
+            with np.errstate(all="ignore"):  # beyond the edge of the lens: left out later
+                normalized = self.rig.cameras[camera].camera.undistort(pixels)
         else:
             normalized = np.ascontiguousarray(rows["normalized"])
-        if not (measurable(pixels).all() and measurable(normalized).all()):
+        used = measurable(pixels).all() and (self._recalibrated or measurable(normalized).all())
+        if not used:
             raise DataError(f"{self.path / name}: a feature is not finite, or too far; {AGAIN}")
         return FeatureObservations(ids, pixels, normalized)
+
+    def _seen_by_lenses(
+        self, cameras: Sequence[FeatureObservations]
+    ) -> tuple[FeatureObservations, ...]:
+        """Without what is outside of the view of the lens by another calibration."""
+        if not self._recalibrated:
+            return tuple(cameras)
+        seen = []
+        for observed, mounted in zip(cameras, self.rig.cameras, strict=False):  # moving: or none
+            inside = mounted.camera.visible(observed.pixels)[1]
+            seen.append(observed if inside.all() else observed.select(inside))
+        lost = sum(map(len, cameras)) - sum(map(len, seen))
+        if lost:
+            text = f"{lost} features of a frame are outside of the view of the lens"
+            self.diagnostics.warn("feature_outside_lens", text)
+        return tuple(seen)
 
     def _with_depth(self, seen: FeatureObservations, data: bytes) -> FeatureObservations:
         rows = np.frombuffer(data, DEPTH_RECORD)
