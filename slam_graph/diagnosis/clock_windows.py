@@ -16,8 +16,9 @@ from typing import ClassVar
 import numpy as np
 
 from slam_graph.arrays import FloatArray
-from slam_graph.diagnosis.camera_and_gyroscope import BAD_OFFSET_S, CLEARLY, FEWEST_PAIRS, SIGMAS
+from slam_graph.diagnosis.camera_and_gyroscope import CLEARLY, FEWEST_PAIRS
 from slam_graph.diagnosis.finding import Finding
+from slam_graph.diagnosis.fit_findings import BAD_OFFSET_S, SIGMAS
 from slam_graph.diagnosis.frame_pairs import frame_pairs
 from slam_graph.diagnosis.gathering import (
     PART_S,

@@ -9,9 +9,10 @@ from dataclasses import asdict, dataclass
 
 from slam_graph.arrays import FloatArray
 from slam_graph.datasets import RecordedSequence
-from slam_graph.diagnosis.camera_and_gyroscope import CameraAndGyroscope, compare, refine
+from slam_graph.diagnosis.camera_and_gyroscope import compare, refine
 from slam_graph.diagnosis.clock_windows import ClockWindows
 from slam_graph.diagnosis.finding import Finding, in_order, no_surer
+from slam_graph.diagnosis.fit_findings import CameraAndGyroscope
 from slam_graph.diagnosis.frame_checks import check_images, check_stamps, check_tracks
 from slam_graph.diagnosis.gathering import (
     Material,

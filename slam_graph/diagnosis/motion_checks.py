@@ -10,8 +10,8 @@ from statistics import median_low
 import numpy as np
 
 from slam_graph.arrays import FloatArray
-from slam_graph.diagnosis.camera_and_gyroscope import CameraAndGyroscope
 from slam_graph.diagnosis.finding import Finding, graded, sureness
+from slam_graph.diagnosis.fit_findings import CameraAndGyroscope
 from slam_graph.diagnosis.motion_window import Window, WindowSolution
 from slam_graph.diagnosis.mountings import axes_text, signed_permutations
 from slam_graph.diagnosis.rotation_fit import RotationFit
