@@ -268,7 +268,7 @@ def test_faults_that_leave_little_to_compare_make_no_calibration_wrong(
     monkeypatch.setattr(verdict, "_MAX_REJECTED", -1.0)  # every run is diagnosed
     recording = open_dataset("demo", faults=faults)
     result = run(recording, overrides=CAUSAL, duration_s=duration_s)
-    assert result.status == "ok", result.message
+    assert result.status in ("ok", "low_coverage"), result.message  # a take-off without IMU
 
 
 @pytest.mark.parametrize("with_imu", [True, False])

@@ -18,7 +18,6 @@ from slam_graph.diagnostics import Diagnostics
 from slam_graph.geometry import NavState
 from slam_graph.pipeline.agreement import Agreement, DivergenceError, JumpError, check_sane
 from slam_graph.results import RunResult
-from slam_graph.results.segments import SHORT_S
 from slam_graph.sensors import ImuData
 
 _MOST_SHORT = 3
@@ -121,7 +120,7 @@ class Recovery:
         lasted_s = result.segments.end(good_ns, str(lost))
         end_ns = result.segments[-1].end_ns if len(result.segments) else None
         result.forget_states(None if end_ns is None else end_ns + 1)
-        self._short = self._short + 1 if lasted_s < SHORT_S else 0
+        self._short = self._short + 1 if lasted_s < result.segments.SHORT_S else 0
         if self._short >= _MOST_SHORT:
             raise lost
         self._agreement = Agreement(result.config)

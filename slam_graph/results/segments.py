@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import Any, Literal, Protocol
+from typing import Any, ClassVar, Literal, Protocol
 
 import gtsam
 import numpy as np
@@ -20,8 +20,6 @@ from slam_graph.geometry import Trajectory
 JoinedBy = Literal["start", "imu", "none"]
 """Of the first segment, joined by the IMU, and not joined: its place is not known."""
 
-SHORT_S = 5.0
-"""A segment that lasts less is short: a wrong calibration may be what ends it."""
 
 _COLUMNS = (
     *("segment", "world", "begin_ns", "end_ns", "states", "joined_by"),
@@ -107,7 +105,10 @@ class Segments:
         losses: times of which it is not known what happened, ns: from the last good state before
             each loss to where that was noticed, whether the run went on or not. A segment from
             which nothing was good adds none.
+        SHORT_S: a segment that lasts less is short: a wrong calibration may be what ends it.
     """
+
+    SHORT_S: ClassVar[float] = 5.0
 
     def __init__(self) -> None:
         self.lost = ""
@@ -131,7 +132,7 @@ class Segments:
     @property
     def lasted(self) -> bool:
         """Whether a segment was good for so long that a wrong calibration is unlikely."""
-        return any(segment.seconds >= SHORT_S for segment in self._all)
+        return any(segment.seconds >= self.SHORT_S for segment in self._all)
 
     @property
     def later(self) -> list[Segment]:
