@@ -26,6 +26,7 @@ _Read = TypeVar("_Read")
 if not CAMPAIGN:
     # Hypothesis also tries numbers and texts of the modules that are loaded, and which these are
     # depends on the tests that ran before in the same process.
+    assert hasattr(providers, "_get_local_constants")
     providers._get_local_constants = providers.Constants
 
 LARGEST_STAMP_NS = 2**62

@@ -108,7 +108,9 @@ def test_a_type_that_claims_long_arrays_is_refused(tmp_path: Path, definition: s
 def test_a_type_with_other_fields_is_damage(tmp_path: Path, field: bytes) -> None:
     """A bag carries the definitions of its types, and may say anything there."""
     path = write_bag(tmp_path, "mcap_file", frames=2)
-    path.write_bytes(path.read_bytes().replace(field, field[:-1] + b"x"))
+    content = path.read_bytes()
+    assert field in content
+    path.write_bytes(content.replace(field, field[:-1] + b"x"))
     with suppress(SlamGraphError):
         read_all(path)
 
@@ -118,7 +120,6 @@ def test_a_type_with_other_fields_is_damage(tmp_path: Path, field: bytes) -> Non
     [
         (b"float64 x", b"byte[8] x"),  # of the same length in definition and message
         (b"float64[9] k", b"float64[3] k"),
-        (b"uint32 width", b"byte[4] width"),
     ],
 )
 def test_a_type_with_fields_of_another_kind_is_damage(
@@ -127,6 +128,7 @@ def test_a_type_with_fields_of_another_kind_is_damage(
     path = write_bag(tmp_path, "mcap_file", frames=2)
     content = path.read_bytes()
     assert old in content
+    assert len(old) == len(new)
     path.write_bytes(content.replace(old, new))
     with pytest.raises(DataError):
         read_all(path)

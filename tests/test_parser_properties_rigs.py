@@ -590,7 +590,6 @@ STARTS = {
     "flight.bag": b"#ROSBAG V2.0\n",
     "flight.mcap": b"\x89MCAP0\r\n",
     "flight.db3": b"SQLite format 3\x00",
-    "flight.mp4": b"\x00\x00\x00\x18ftypmp42",
 }
 
 READERS: dict[str, Callable[[Path], Any]] = {
