@@ -4,6 +4,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 
 from slam_graph.arrays import BoolArray, FloatArray
@@ -18,6 +20,9 @@ of its turns on: a platform on a plane never turns about two of them."""
 _LEAST_CHANGE = 1.0
 """Gravity moves along an axis of the accelerometer from so much on, m/s²."""
 _MOST = 0.75
+"""This share of the turns about an axis are smaller than what counts as its turn."""
+_BLOCK_S = 1.0
+"""Gravity is followed for so long at a time, as the bias of the gyroscope turns it away."""
 _FIX = "look at the driver and at the columns that are read; --no-imu runs without the IMU"
 
 
@@ -71,14 +76,13 @@ def check_accelerometer(
     Args:
         parts: with samples.
         gyroscopes: of the parts.
-        turns: whether the images turn, which tells as well where all axes are constant.
+        turns: whether the images turn; nothing is said where they do not.
     """
-    for part, gyroscope in zip(parts, gyroscopes, strict=True):
+    for part, gyroscope in zip(parts if turns else [], gyroscopes if turns else [], strict=True):
         force = part.imu.accel
         constant = constant_axes(force)
-        expected = np.ptp(np.einsum("nji,j->ni", gyroscope.R, force[0]), axis=0)
-        alone = bool(np.all(constant)) and turns and float(np.linalg.norm(force[0])) > 0.0
-        if alone or np.any(constant & (expected > _LEAST_CHANGE)):
+        alone = bool(np.all(constant)) and float(np.linalg.norm(force[0])) > 0.0
+        if alone or np.any(constant & (_change_of_gravity(gyroscope) > _LEAST_CHANGE)):
             what = (
                 f"the accelerometer says nothing: {_said(constant, force[0], 'm/s²')}, while the "
                 "platform turns"
@@ -86,6 +90,18 @@ def check_accelerometer(
             values = {"axes": constant.tolist()}
             return [Finding("accelerometer_constant", "error", what, _FIX, values=values)]
     return []
+
+
+def _change_of_gravity(gyroscope: Gyroscope) -> FloatArray:
+    """How far gravity moves along each axis (3,) within `_BLOCK_S`, by the gyroscope, m/s²."""
+    ends = np.arange(0.0, float(gyroscope.t[-1]) + _BLOCK_S, _BLOCK_S)
+    largest = np.zeros(3)
+    for first, last in pairwise(np.searchsorted(gyroscope.t, ends).tolist()):
+        R = gyroscope.R[first:last]
+        if len(R):
+            forces = np.einsum("nji,jk,k->ni", R, R[0], gyroscope.force[first])
+            largest = np.maximum(largest, np.ptp(forces, axis=0))
+    return largest
 
 
 def _said(constant: BoolArray, sample: FloatArray, unit: str) -> str:

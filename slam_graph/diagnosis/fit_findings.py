@@ -26,7 +26,7 @@ _OFFSET_S, BAD_OFFSET_S = 5e-3, 1.5e-2
 _FOCAL, _BAD_FOCAL = 0.02, 0.025
 _TURN_RAD, _BAD_TURN_RAD = np.deg2rad(1.2), np.deg2rad(1.5)
 _READOUT_S = 8e-3
-_SCALE, _BAD_SCALE = 0.02, 0.025
+_SCALE, _BAD_SCALE = 0.02, 0.05
 _KNOWN_OFFSET_S, _KNOWN_FOCAL = 1e-2, 0.05
 """Camera and gyroscope agree only if clocks and focal length are known so well."""
 _LIKE_PRINCIPAL_POINT_RAD = np.deg2rad(5.0)

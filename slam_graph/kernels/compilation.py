@@ -36,8 +36,8 @@ def compiled(*signatures: str) -> Callable[[_Kernel], _Kernel]:
     """
 
     def decorate(function: _Kernel) -> _Kernel:
-        # a kernel is stored with the functions that it calls; an entry for callers that there are
-        # not would only take time to compile
+        # a kernel is stored with the functions that it calls; entries that nobody uses would only
+        # take time to compile
         options: dict[str, Any] = {
             "cache": bool(signatures),
             "no_cpython_wrapper": not signatures,

@@ -12,7 +12,9 @@ The time offset between camera and IMU is watched over the whole run, as it may 
 from __future__ import annotations
 
 import logging
+import math
 from collections import deque
+from collections.abc import Mapping
 from dataclasses import asdict
 from typing import TYPE_CHECKING
 
@@ -34,6 +36,8 @@ _PAIRS, _PAIRS_APART_NS = 4, 1_500_000_000
 """Images of two cameras that are kept, and the time between them."""
 _FIRST_LOOK_NS = 5_000_000_000
 """A run that has waited so long for a start is looked at, and again after twice that."""
+_HINDERING = {"gyroscope_scale": 0.1, "baseline": 0.3}
+"""Logarithms of factors from which these keep a run from starting; smaller ones only harm it."""
 _FAILED = ("not_initialized", "diverged", "low_coverage")
 _DOUBTS = ("start_corrected", "new_segment", "scale_unknown")
 """Warnings after which an estimate that came to its end is doubted."""
@@ -44,6 +48,13 @@ _FEWEST_SHARED = 0.25
 and more where cameras are mounted side by side."""
 
 logger = logging.getLogger(__name__)
+
+
+def _hinders(kind: str, values: Mapping[str, object]) -> bool:
+    """Whether a fault of so large a factor keeps a run from starting."""
+    factor = values.get("factor")
+    least = _HINDERING.get(kind, 0.0)
+    return not isinstance(factor, float) or abs(math.log(factor)) >= least
 
 
 class _Memory:
@@ -211,7 +222,10 @@ class Verdict(Stage):
         """
         lost = bool(self._result.segments.lost)
         if self._waits_since_ns is None:
-            self._waits_since_ns, self._look_ns = stamp_ns, 0 if lost else _FIRST_LOOK_NS
+            losses = self._result.segments.losses
+            # what the loss was is left out only where it is known when it began
+            known = lost and bool(losses) and stamp_ns - losses[-1][1] < _FIRST_LOOK_NS
+            self._waits_since_ns, self._look_ns = stamp_ns, 0 if known else _FIRST_LOOK_NS
         waited_ns = stamp_ns - self._waits_since_ns
         if waited_ns < self._look_ns:
             return
@@ -236,7 +250,11 @@ class Verdict(Stage):
             "focal_length": calibration.intrinsics,
         }
         found = self._diagnosed(rig, across_losses=False).certain_errors
-        certain = [finding for finding in found if not estimated.get(finding.kind, False)]
+        certain = [
+            finding
+            for finding in found
+            if not estimated.get(finding.kind, False) and _hinders(finding.kind, finding.values)
+        ]
         return "; or ".join([f.with_fix for f in certain[:1]] + [f.what for f in certain[1:2]])
 
     def _judge(self, failed: bool, contradictions: list[str], clocks: Diagnosis | None) -> None:
@@ -283,10 +301,14 @@ class Verdict(Stage):
         from slam_graph.diagnosis import Diagnosis  # it takes a moment to import
 
         kept, losses = self._kept, self._result.segments.losses
-        frames = kept.frames
+        frames, imu = kept.frames, kept.imu
         if not across_losses:
             frames = [f for f in frames if not any(a < f.stamp_ns < b for a, b in losses)]
-        return Diagnosis.of_tracks(rig, frames, kept.imu, kept.pairs, losses)
+            good = np.ones(len(imu), bool)
+            for begin_ns, end_ns in losses:
+                good &= (imu.stamps_ns <= begin_ns) | (imu.stamps_ns >= end_ns)
+            imu = ImuData(imu.stamps_ns[good], imu.gyro[good], imu.accel[good])
+        return Diagnosis.of_tracks(rig, frames, imu, kept.pairs, losses)
 
     def _final_rig(self) -> Rig:
         """The rig as calibrated, corrected or estimated, whichever came last."""

@@ -22,6 +22,8 @@ _LONGEST_STEP_S = 0.02
 """A longer time between two samples is integrated in several steps. The noise of a single one is
 that of a constant acceleration: it ties the position to the velocities at both ends, as if it were
 known to be half their sum times the duration."""
+_MOST_STEPS = 500
+"""Of a gap, however long it is."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -87,7 +89,8 @@ class ImuData:
         pim = gtsam.PreintegratedCombinedMeasurements(params, bias)
         durations_s, gyro, accel = self.steps()
         if durations_s.max() > _LONGEST_STEP_S:
-            pieces = np.ceil(durations_s / _LONGEST_STEP_S - 1e-6).astype(int)
+            pieces = np.ceil(durations_s / _LONGEST_STEP_S - 1e-6)
+            pieces = np.clip(pieces, 1, _MOST_STEPS).astype(int)
             durations_s, gyro, accel = (
                 np.repeat(values, pieces, axis=0) for values in (durations_s / pieces, gyro, accel)
             )

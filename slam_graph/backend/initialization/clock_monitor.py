@@ -65,10 +65,15 @@ class ClockMonitor:
 
     def confirms_calibration(self, found: GyroAlignment) -> bool:
         """Whether the calibrated offset was right before, so that another one is a change."""
-        if self._known is None or self._known[1] > _KNOWN_SIGMA_S:
+        if self._known is None or not self.knows:
             return False
         apart_s = _APART_SIGMAS * float(np.hypot(found.offset_sigma_s, self._known[1]))
         return self._is_calibrated and abs(found.offset_s - self._known[0]) > apart_s
+
+    @property
+    def knows(self) -> bool:
+        """Whether the offset that holds is known well."""
+        return self._known is not None and self._known[1] <= _KNOWN_SIGMA_S
 
     @property
     def _is_calibrated(self) -> bool:
@@ -84,7 +89,7 @@ class ClockMonitor:
             turns: a few rotations over the last seconds.
             imu: samples that cover them.
         """
-        if self._known is None or self._known[1] > _KNOWN_SIGMA_S:
+        if self._known is None or not self.knows:
             return True
         offset_s, sigma_s = self._known
         step_s, step_sigma_s = offset_step(turns, imu, self._R, offset_s)

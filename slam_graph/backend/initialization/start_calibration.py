@@ -36,6 +36,8 @@ _RETRY_NS, _LATER_RETRY_NS = 400_000_000, 900_000_000
 """Time between two estimates at the start, and between two tests of the clock later."""
 _LATER_PAUSE_NS, _LONGEST_PAUSE_NS = 5_000_000_000, 60_000_000_000
 """Time after an estimate that shows nothing, and after many of them: each takes 0.1 s."""
+_WAIT_NS = 5_000_000_000
+"""A start waits so long for an offset that was right before to fit again; then it takes the new."""
 _RECENT_NS = 6_000_000_000
 """How long frames are kept to begin anew from."""
 _CLEAR_WAITING = 15.0
@@ -91,7 +93,7 @@ class StartCalibration:
         self.mounted = self._camera.rotation_known
         self.recent: deque[FeatureFrame] = deque()
         self._turns = VisualTurns(self._camera, config.noise.pixel_sigma)
-        self._next_ns, self._pause_ns = 0, _LATER_PAUSE_NS
+        self._next_ns, self._pause_ns, self._doubted_ns = 0, _LATER_PAUSE_NS, 0
         self._checks = config.initialization.check_calibration
         self._monitor = ClockMonitor(self._camera) if self.mounted else None
         self.done = not self._checks and self.mounted
@@ -140,7 +142,10 @@ class StartCalibration:
         if change is not None:
             return change
         if self._monitor is not None and self._monitor.confirms_calibration(found):
-            return None  # the clock has changed since, which is said once there is a state
+            # the clock has changed since, which is said once there is a state
+            self._doubted_ns = self._doubted_ns or frame.stamp_ns
+            if started or frame.stamp_ns - self._doubted_ns < _WAIT_NS:
+                return None
         return self._judged(found, _ADOPTED_SIGMA_S if started else _WAITING_SIGMA_S)
 
     def _watch(
@@ -160,7 +165,8 @@ class StartCalibration:
         change = self.clock_change(imu)
         if change is not None or not monitor.contradicted:
             self._next_ns = frame.stamp_ns + self._pause_ns
-            self._pause_ns = min(2 * self._pause_ns, _LONGEST_PAUSE_NS)
+            if monitor.knows:  # otherwise it is still to be found
+                self._pause_ns = min(2 * self._pause_ns, _LONGEST_PAUSE_NS)
         return change
 
     def clock_change(self, imu: ImuBuffer) -> ClockChange | None:

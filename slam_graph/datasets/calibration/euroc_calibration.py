@@ -43,22 +43,54 @@ def read_camera(entry: YamlValue) -> Camera:
     *leading, fx, fy, cx, cy = intrinsics.numbers(4 + model.leading)
     size = entry.require("resolution")
     width, height = size.numbers(2)
-    if not all(0 < value <= _LARGEST_SIZE and value == int(value) for value in (width, height)):
-        raise DataError(f"{size.where}: expected width and height in pixels, two whole numbers")
+    check_size((width, height), size.where)
     count = len(model.coefficient_names) - model.leading
     others = [0.0] * count
     if distorted and count:
         values = entry.require("distortion_coefficients", "distortion_coeffs")
         others = values.numbers(count)
     coefficients = (*leading, *others)
-    numbers = (fx, fy, cx, cy, *coefficients)
-    if max(map(abs, numbers)) > _LARGEST_NUMBER or 0.0 < min(fx, fy) < _SHORTEST_FOCAL_PX:
-        raise DataError(f"{intrinsics.where}: no lens has numbers as large, or as small, as these")
+    return lens(model, (fx, fy, cx, cy), coefficients, (int(width), int(height)), intrinsics.where)
+
+
+def check_size(size: tuple[float, float], where: str) -> None:
+    """Refuse what can be no width and height of an image, pixels.
+
+    Raises:
+        DataError: naming `where` they are from.
+    """
+    if not all(0 < value <= _LARGEST_SIZE and value == int(value) for value in size):
+        raise DataError(f"{where}: expected width and height in pixels, two whole numbers")
+
+
+def lens(
+    model: CameraModel,
+    intrinsics: tuple[float, float, float, float],
+    coefficients: tuple[float, ...],
+    size: tuple[int, int],
+    where: str,
+) -> Camera:
+    """A camera with numbers that a lens may have.
+
+    Args:
+        model: of the distortion.
+        intrinsics: fx, fy, cx, cy, pixels.
+        coefficients: of the distortion.
+        size: width and height, pixels.
+        where: these are from, for messages.
+
+    Raises:
+        DataError: naming `where`.
+    """
+    numbers = (*intrinsics, *coefficients)
+    sound = all(abs(value) <= _LARGEST_NUMBER for value in numbers)
+    if not sound or 0.0 < min(intrinsics[:2]) < _SHORTEST_FOCAL_PX:
+        raise DataError(f"{where}: no lens has numbers as large, or as small, as these")
     try:
         model.check(coefficients)
-        return Camera(fx, fy, cx, cy, model.name, coefficients, int(width), int(height))
+        return Camera(*intrinsics, model.name, coefficients, *size)
     except DataError as error:
-        raise DataError(f"{intrinsics.where}: {error}") from None
+        raise DataError(f"{where}: {error}") from None
 
 
 def _read_model(entry: YamlValue) -> tuple[CameraModel, bool]:

@@ -21,6 +21,7 @@ import yaml
 
 from slam_graph.arrays import FloatArray
 from slam_graph.datasets.calibration.calibration_yaml import YamlValue, read_yaml
+from slam_graph.datasets.calibration.euroc_calibration import check_size, lens
 from slam_graph.datasets.rosbag.bag import REINDEX, Bag, Message
 from slam_graph.datasets.rosbag.messages import (
     CAMERA_INFO,
@@ -253,8 +254,10 @@ def _camera(bag: Bag, topic: str, info: _CameraInfo) -> Camera:
     rectified = "rect" in topic.rpartition("/")[2]
     matrix, D, size = info.P if rectified else info.K, info.D, info.size
     fx, fy, cx, cy = matrix[[0, 1, 0, 1], [0, 1, 2, 2]].tolist()
+    intrinsics, where = (fx, fy, cx, cy), f"{bag.path}: CameraInfo of {topic}"
+    check_size(size, where)
     if rectified or not np.any(D):
-        return Camera(fx, fy, cx, cy, "none", (), *size)
+        return lens(CAMERA_MODELS["none"](), intrinsics, (), size, where)
     models = {name: model for _, model in CAMERA_MODELS.working() for name in model.ros_names}
     model = models.get(info.distortion_model)
     count = 0 if model is None else len(model.coefficient_names)
@@ -265,7 +268,7 @@ def _camera(bag: Bag, topic: str, info: _CameraInfo) -> Camera:
             f"{bag.path}: the distortion of CameraInfo is {given}; known, with the number of "
             f"coefficients that may differ from zero: {known}; give --calibration"
         )
-    return Camera(fx, fy, cx, cy, model.name, tuple(D[:count].tolist()), *size)
+    return lens(model(), intrinsics, tuple(D[:count].tolist()), size, where)
 
 
 def _static_transforms(bag: Bag) -> dict[str, dict[str, gtsam.Pose3]]:

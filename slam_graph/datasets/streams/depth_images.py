@@ -37,8 +37,8 @@ DepthProcess = Callable[[NDArray[Any]], NDArray[Any]]
 _REACH = 0.7
 """A registered point fills the pixels up to this share of a depth pixel's width around it: half,
 and some more, as points on a slanted surface are farther apart."""
-_MOST_FINER = 16.0
-"""A camera resolves no more times as finely as the depth sensor; the cost grows with its square."""
+_MOST_PIXELS = 2e8
+"""Most pixels of the camera that an image of the depth sensor is spread over, one by one."""
 
 
 class DepthStream(Protocol):
@@ -161,7 +161,7 @@ class Registration:
         self._origin = np.asarray(camera_T_depth.translation())
         self._camera = camera
         ratio = max(camera.fx / lens.fx, camera.fy / lens.fy, 1.0)
-        if ratio > _MOST_FINER:
+        if ratio**2 * lens.width * lens.height > _MOST_PIXELS:
             raise DataError(
                 f"calibration of the depth sensor: its focal length is {ratio:.0f} times shorter "
                 "than that of its camera; correct its intrinsics"

@@ -113,6 +113,10 @@ class _ImuCleaner:
         if float(np.median(np.abs(pauses - period_ns))) > _EVEN * period_ns:
             return
         few = (pauses > _MISSING_PERIODS * period_ns) & (pauses <= _GAP_PERIODS * period_ns)
+        # a stamp that is late makes the next pause as much shorter
+        around = np.concatenate([[np.inf], pauses, [np.inf]])
+        with_shorter = pauses + np.minimum(around[:-2], around[2:])
+        few &= with_shorter > (_MISSING_PERIODS + 1.0) * period_ns
         for k in np.flatnonzero(few):
             count = round(pauses[k] / period_ns) - 1
             what = f"{count} sample{'s' * (count > 1)} of the IMU missing before {stamps_ns[k + 1]}"
