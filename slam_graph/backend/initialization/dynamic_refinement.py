@@ -25,7 +25,7 @@ from slam_graph.backend.cost.adaptive_imu_noise import MotionChange
 from slam_graph.backend.cost.cost import Cost, Linearization, TrackFeatures
 from slam_graph.backend.cost.feature_factors import SummedFeatures
 from slam_graph.backend.cost.feature_tracks import Observations, is_in, sorted_unique
-from slam_graph.backend.cost.imu_factor import imu_factor
+from slam_graph.backend.cost.imu_factor import IMU_GAP_SCALE, imu_factor
 from slam_graph.backend.cost.robust_loss import RobustLoss
 from slam_graph.backend.cost.triangulation import Triangulation, triangulate
 from slam_graph.backend.engine_protocol import EngineContext
@@ -251,7 +251,9 @@ class DynamicRefinement:
         blocks = frames.imu_between(context.imu)
         for k, (before, samples) in enumerate(zip([None, *blocks], blocks, strict=False)):
             change = MotionChange.between(before, samples)
-            params = noise.params(least_factor=_WHITE_NOISE_FACTOR, change=change)
+            gap_s = context.imu.largest_gap_s(*samples.stamps_ns[[0, -1]].tolist())
+            scale = IMU_GAP_SCALE if gap_s > context.config.noise.max_imu_gap_s else 1.0
+            params = noise.params(scale, _WHITE_NOISE_FACTOR, change)
             factors.append(imu_factor(k, k + 1, samples.preintegrated(bias, params)))
         first = replace(start, covariance=prior_covariance(MOTION_PRIOR))
         return factors + prior_factors(fix_gauge(first, MOTION_PRIOR))
