@@ -1,6 +1,9 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""Files that appear whole or not at all, and one line where the system refuses to write them."""
+"""Files that appear whole or not at all, and one line where the system refuses to write them.
+
+And how large numbers and times that are read may be, so that arithmetic with them stays finite.
+"""
 
 from __future__ import annotations
 
@@ -12,8 +15,14 @@ import socket
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from slam_graph.errors import DataError
+
+if TYPE_CHECKING:  # commands that only say what there is do without NumPy
+    from numpy.typing import NDArray
+
+    from slam_graph.arrays import BoolArray, IntArray
 
 __all__ = ["Files"]
 
@@ -194,10 +203,35 @@ def _lives(pid: int) -> bool:
     return True
 
 
+def are_measurable(values: NDArray[Any]) -> BoolArray:
+    """Which values (...) are finite, and not beyond any measurement."""
+    found: BoolArray = abs(values) <= Files.LARGEST
+    return found
+
+
+def are_times(stamps_ns: IntArray) -> BoolArray:
+    """Which stamps (N,) are near enough to zero to be times in ns."""
+    end_ns = Files.LARGEST_STAMP_NS
+    found: BoolArray = (stamps_ns > -end_ns) & (stamps_ns < end_ns)
+    return found
+
+
 class Files:
-    """What is done with files."""
+    """What is done with files.
+
+    Attributes:
+        LARGEST: numbers in them are no larger: their squares fit into floating-point numbers of
+            32 bits.
+        LARGEST_STAMP_NS: times in them are nearer to zero, before the year 2116: differences of two
+            of them fit into 64 bits.
+    """
+
+    LARGEST: ClassVar[float] = 1e18
+    LARGEST_STAMP_NS: ClassVar[int] = 2**62
 
     appearing = staticmethod(appearing)
+    are_measurable = staticmethod(are_measurable)
+    are_times = staticmethod(are_times)
     make_folder = staticmethod(make_folder)
     partial_folder = staticmethod(partial_folder)
     partial_name = staticmethod(partial_name)

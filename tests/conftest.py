@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Fixtures shared by all tests: where the recordings are; kernels that are compiled."""
 
+import logging
 import os
 from importlib import import_module
 from pathlib import Path
@@ -50,3 +51,15 @@ def stock(tmp_path_factory: pytest.TempPathFactory) -> "Stock":
     folder = os.environ.get("SLAM_GRAPH_DATA")
     real = Path(folder).resolve() if folder and Path(folder).is_dir() else None
     return Stock(tmp_path_factory.mktemp("stock"), real)
+
+
+@pytest.fixture
+def quiet(caplog: pytest.LogCaptureFixture) -> None:
+    """What is dropped and counted is not written down for each of many files."""
+    caplog.set_level(logging.CRITICAL, logger="slam_graph")
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Where all examples of a file of tests are written, one over the other."""
+    return tmp_path_factory.mktemp("examples")

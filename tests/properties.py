@@ -19,6 +19,7 @@ from hypothesis import strategies as st
 from hypothesis.internal.conjecture import providers
 
 from slam_graph.errors import SlamGraphError
+from slam_graph.files import Files
 from slam_graph.geometry import Trajectory
 
 _Read = TypeVar("_Read")
@@ -29,7 +30,8 @@ if not CAMPAIGN:
     assert hasattr(providers, "_get_local_constants")
     providers._get_local_constants = providers.Constants
 
-LARGEST_STAMP_NS = 2**62
+
+LARGEST_STAMP_NS = Files.LARGEST_STAMP_NS
 """What readers take for a time is nearer to zero."""
 
 
@@ -74,7 +76,10 @@ def vectors(count: int, largest: float = 1e17) -> st.SearchStrategy[list[float]]
 
 
 def stamps(
-    fewest: int = 0, most: int = 5, least: int = 1 - LARGEST_STAMP_NS, end: int = LARGEST_STAMP_NS
+    fewest: int = 0,
+    most: int = 5,
+    least: int = 1 - Files.LARGEST_STAMP_NS,
+    end: int = Files.LARGEST_STAMP_NS,
 ) -> st.SearchStrategy[np.ndarray]:
     """(N,) increasing times, from `least` to before `end`."""
     inside = st.integers(least, end - 1)

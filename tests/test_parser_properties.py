@@ -7,7 +7,6 @@ values with increasing times, or refused in one line.
 """
 
 import bz2
-import logging
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -45,19 +44,10 @@ from slam_graph.pose_graph.graph import PoseGraph, Poses
 from slam_graph.pose_graph.graph_files import g2o_lines, read_pose_graph
 from slam_graph.sensors import AidingData, ImuData
 
-pytestmark = pytest.mark.filterwarnings("error::RuntimeWarning")
-
-
-@pytest.fixture(autouse=True)
-def quiet(caplog: pytest.LogCaptureFixture) -> None:
-    """What is dropped and counted is not written down for each of the many files."""
-    caplog.set_level(logging.CRITICAL, logger="slam_graph")
-
-
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Where all examples are written, one over the other."""
-    return tmp_path_factory.mktemp("properties")
+pytestmark = [
+    pytest.mark.filterwarnings("error::RuntimeWarning"),
+    pytest.mark.usefixtures("quiet"),
+]
 
 
 def alike(one: Trajectory, other: Trajectory, decimals: float) -> None:

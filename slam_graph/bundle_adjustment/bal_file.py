@@ -20,6 +20,7 @@ from scipy.spatial.transform import Rotation
 from slam_graph.arrays import FloatArray
 from slam_graph.bundle_adjustment.bal_problem import CAMERA_DIM, BalEstimates, BalProblem
 from slam_graph.errors import DataError
+from slam_graph.files import Files
 
 _BZIP2_MAGIC = b"BZh"
 _MAX_UNPACKED, _MIN_UNPACKED = 50, 2**20
@@ -27,8 +28,6 @@ _MAX_UNPACKED, _MIN_UNPACKED = 50, 2**20
 _HEADER = 3
 _OBSERVATION = 4
 """Numbers of the header and of an observation."""
-_MAX_NUMBER = 1e18
-"""Largest magnitude of a number, so that squares are finite, with 32 bits too."""
 _MAX_HEADER_BYTES = 200
 """The first line of a file of this format is shorter."""
 
@@ -82,7 +81,7 @@ def read_bal(path: Path | str) -> BalProblem:
             f"{_where(path, text, expected)}: {len(numbers) - expected} numbers more than the "
             "header promises"
         )
-    bad = np.flatnonzero(~(np.abs(numbers) <= _MAX_NUMBER))
+    bad = np.flatnonzero(~Files.are_measurable(numbers))
     if len(bad):
         raise DataError(f"{_where(path, text, int(bad[0]))}: a number is not finite, or too large")
     seen, by_camera, by_point = np.split(

@@ -17,14 +17,14 @@ from slam_graph.datasets.calibration.euroc_calibration import read_body_T_sensor
 from slam_graph.datasets.streams.csv_rows import (
     STAMP_TEXT,
     Rows,
-    measurable,
+    check_times,
     read_rows,
-    refuse_wild_stamps,
     stamps_from_seconds,
 )
 from slam_graph.datasets.streams.vector_lengths import lengths_of
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import DataError
+from slam_graph.files import Files
 from slam_graph.geometry import Trajectory
 
 FOLDERS = ("state_groundtruth_estimate0", "mocap0", "vicon0")
@@ -146,7 +146,7 @@ def _parse_block(rows: Rows) -> tuple[IntArray, FloatArray]:
         return stamps_from_seconds(rows, table["stamp"]), table["values"]
     dtype = [("stamp", "i8"), ("values", "f8", (count,))]
     table = rows.parse(dtype, f"stamp [ns] and {count} numbers", columns)
-    refuse_wild_stamps(rows, table["stamp"])
+    check_times(rows, table["stamp"])
     values = table["values"].copy()
     values[:, 3:7] = table["values"][:, [4, 5, 6, 3]]
     return table["stamp"], values
@@ -160,7 +160,7 @@ def _usable(
     diagnostics: Diagnostics,
 ) -> NDArray[np.intp]:
     """Indices of the rows that are finite, have a rotation, and are later than those before."""
-    whole = measurable(values).all(axis=1)
+    whole = Files.are_measurable(values).all(axis=1)
     lengths = lengths_of(values[:, 3:7])
     whole &= (lengths > _SMALLEST_QUATERNION) & np.isfinite(lengths)
     for k in np.flatnonzero(~whole):

@@ -30,6 +30,7 @@ from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.datasets import Rows
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import ConfigError, DataError, closest
+from slam_graph.files import Files
 from slam_graph.pose_graph.graph import InformationRepair, PoseGraph, Poses, RotationInformation
 from slam_graph.pose_graph.information_repair import positive_definite
 
@@ -79,8 +80,8 @@ _LINES = {
 }
 
 
-_LARGEST_POSE, _LARGEST_INFORMATION = 1e18, 1e50
-"""Magnitudes of numbers of poses and of information, so that costs are finite."""
+_LARGEST_INFORMATION = 1e50
+"""Largest magnitude of a number of information, so that costs are finite."""
 
 _QUATERNION_TOLERANCE = 0.1
 """Largest deviation of the norm of a quaternion from 1: files have few digits."""
@@ -189,7 +190,7 @@ def _parse(rows: Rows, tag: str) -> _Block:
     dtype = [("tag", "S16"), ("ids", np.int64, (line.ids,)), ("numbers", float, (size + entries,))]
     table = rows.parse(dtype, f"{tag}, {line.expected()}", delimiter=None)
     ids, numbers = table["ids"], table["numbers"]
-    _check_numbers(rows, numbers[:, :size], _LARGEST_POSE)
+    _check_numbers(rows, numbers[:, :size], Files.LARGEST)
     _check_numbers(rows, numbers[:, size:], _LARGEST_INFORMATION)
     k = 3 * (line.dimension - 1)
     information = np.tile(np.eye(k), (len(ids) if line.ids == 2 else 0, 1, 1))

@@ -14,7 +14,7 @@ from slam_graph import maps
 from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.errors import DataError
 from slam_graph.files import Files
-from slam_graph.results.result_files import LARGEST, find_map, refuse_to_replace
+from slam_graph.results.result_files import find_map, refuse_to_replace
 
 if TYPE_CHECKING:
     from slam_graph.maps import SlamMap
@@ -133,7 +133,7 @@ def read_ply(path: Path | str) -> FloatArray:
     if not separator or not binary or properties != _POSITION_PROPERTIES or not whole:
         raise DataError(f"{path}: not a point cloud of x, y, z as slam-graph writes it")
     points = np.frombuffer(body, "<f8").reshape(-1, 3).astype(np.float64)
-    return np.asarray(points[(np.abs(points) <= LARGEST).all(axis=1)])
+    return np.asarray(points[Files.are_measurable(points).all(axis=1)])
 
 
 def save_map(content: SlamMap, path: Path | str, force: bool = False) -> None:

@@ -240,12 +240,6 @@ def state_lines(history: StateHistory) -> Iterator[str]:
         yield ",".join([str(stamp_ns), *cells]) + "\n"
 
 
-LARGEST = 1e18
-"""Numbers of a result are no larger: their squares fit into numbers of 32 bits."""
-_LARGEST_NS = 2**62
-"""Times are no larger, so that their differences fit."""
-
-
 def read_states(path: Path) -> tuple[IntArray, dict[str, FloatArray]]:
     """Read what `state_lines` wrote; the columns may be in any order.
 
@@ -301,7 +295,7 @@ def _times_ns(cells: Iterable[str]) -> IntArray:
         ValueError: if a cell is none.
     """
     times = [int(cell) for cell in cells]
-    if any(abs(time) >= _LARGEST_NS for time in times):
+    if any(abs(time) >= Files.LARGEST_STAMP_NS for time in times):
         raise ValueError("a time does not fit into 62 bits")
     return np.array(times, np.int64)
 
@@ -313,7 +307,7 @@ def _numbers(cells: Iterable[str]) -> FloatArray:
         ValueError: if a cell is none.
     """
     values = np.array([float(cell or "nan") for cell in cells], np.float64)
-    values[np.abs(values) > LARGEST] = np.nan
+    values[np.abs(values) > Files.LARGEST] = np.nan
     return values
 
 

@@ -15,15 +15,16 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from slam_graph.errors import DataError
+from slam_graph.files import Files
 
-_Time = Annotated[int, Field(gt=-(2**62), lt=2**62)]
+_Time = Annotated[int, Field(gt=-Files.LARGEST_STAMP_NS, lt=Files.LARGEST_STAMP_NS)]
 """A time in ns; differences of two of them fit into 64 bits."""
 
 _Alignment = Literal["none", "yaw", "se3", "sim3"]
 """Alignments that errors of runs are given for."""
 
-_Count = Annotated[int, Field(ge=0, lt=2**62)]
-_Amount = Annotated[float, Field(ge=0.0, le=1e18)]
+_Count = Annotated[int, Field(ge=0, lt=Files.LARGEST_STAMP_NS)]
+_Amount = Annotated[float, Field(ge=0.0, le=Files.LARGEST)]
 
 
 class _Table(BaseModel):

@@ -32,7 +32,7 @@ from slam_graph.datasets.calibration.euroc_calibration import read_euroc_rig, re
 from slam_graph.datasets.calibration.kalibr_calibration import read_kalibr
 from slam_graph.datasets.groundtruth import find_groundtruth
 from slam_graph.datasets.sequence import ReaderOptions
-from slam_graph.datasets.streams.csv_rows import LARGEST_STAMP_NS, read_rows
+from slam_graph.datasets.streams.csv_rows import read_rows
 from slam_graph.datasets.streams.depth_images import FileDepth
 from slam_graph.datasets.streams.image_sequence import STEREO_TOLERANCE_S, ImageSequence
 from slam_graph.datasets.streams.images import FileImages, file_within
@@ -40,6 +40,7 @@ from slam_graph.datasets.streams.imu_stream import ImuFile, parse_imu_rows
 from slam_graph.datasets.streams.pairing import in_order
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import DataError
+from slam_graph.files import Files
 from slam_graph.sensors import Rig
 
 
@@ -161,7 +162,7 @@ def _parse_image_row(line: str, where: Callable[[], str], folder: Path) -> tuple
         parsed = int(stamp)
     except ValueError:
         parsed = -1
-    if not 0 <= parsed < LARGEST_STAMP_NS or not name.strip():
+    if not 0 <= parsed < Files.LARGEST_STAMP_NS or not name.strip():
         raise DataError(f"{where()}: cannot read '{line.strip()[:100]}' as stamp [ns], file name")
     return parsed, file_within(folder, name.strip(), where())
 

@@ -24,7 +24,6 @@ from slam_graph.datasets.calibration.kalibr_calibration import read_kalibr
 from slam_graph.datasets.formats.euroc import ordered_images
 from slam_graph.datasets.sequence import ReaderOptions
 from slam_graph.datasets.streams.csv_rows import (
-    LARGEST_STAMP_NS,
     STAMP_TEXT,
     Rows,
     nanoseconds,
@@ -37,6 +36,7 @@ from slam_graph.datasets.streams.images import FileImages, file_within
 from slam_graph.datasets.streams.imu_stream import INTEGER_STAMPS, ImuFile
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import DataError, closest
+from slam_graph.files import Files
 from slam_graph.sensors import ImuData, Rig
 
 _SHORTEST_PERIOD_NS = 100_000
@@ -171,7 +171,7 @@ def stamps_from_names(paths: Sequence[Path]) -> IntArray | None:
             stamps.append(nanoseconds(path.stem) if seconds else int(path.stem))
         except (ValueError, ArithmeticError):
             return None
-    if any(abs(stamp) >= LARGEST_STAMP_NS for stamp in stamps):
+    if any(abs(stamp) >= Files.LARGEST_STAMP_NS for stamp in stamps):
         return None
     together = np.array(stamps, np.int64)
     if len(together) > 1 and float(np.median(np.abs(np.diff(together)))) < _SHORTEST_PERIOD_NS:
@@ -206,8 +206,8 @@ def _stamp(text: str, rows: Rows, index: int, seconds: bool) -> int:
     try:
         stamp_ns = int(text)
     except ValueError:
-        stamp_ns = LARGEST_STAMP_NS
-    if abs(stamp_ns) >= LARGEST_STAMP_NS:
+        stamp_ns = Files.LARGEST_STAMP_NS
+    if abs(stamp_ns) >= Files.LARGEST_STAMP_NS:
         raise DataError(f"{rows.where(index)}: '{text[:80]}' is not a time") from None
     return stamp_ns
 

@@ -52,10 +52,10 @@ from slam_graph.datasets.sequence import (
     RecordedSequence,
     SequenceInfo,
 )
-from slam_graph.datasets.streams.csv_rows import LARGEST_STAMP_NS, measurable
 from slam_graph.datasets.streams.imu_stream import clean_blocks
 from slam_graph.datasets.streams.mask_images import MASKS, MaskFolder, read_classes
 from slam_graph.errors import DataError
+from slam_graph.files import Files
 from slam_graph.geometry import NavState
 from slam_graph.sensors import FeatureFrame, FeatureObservations, ImuData
 
@@ -270,7 +270,9 @@ class TrackRecordingSequence(RecordedSequence):
                 normalized = self.rig.cameras[camera].camera.undistort(pixels)
         else:
             normalized = np.ascontiguousarray(rows["normalized"])
-        used = measurable(pixels).all() and (self._recalibrated or measurable(normalized).all())
+        used = Files.are_measurable(pixels).all() and (
+            self._recalibrated or Files.are_measurable(normalized).all()
+        )
         if not used:
             raise DataError(f"{self.path / name}: a feature is not finite, or too far; {AGAIN}")
         return FeatureObservations(ids, pixels, normalized)
@@ -325,7 +327,7 @@ class TrackRecordingSequence(RecordedSequence):
                 f"{self.path / FRAMES}: the numbers of features do not add up to the {features} of "
                 f"{META}; {AGAIN}"
             )
-        if np.any(stamps[1:] <= stamps[:-1]) or np.any(np.abs(stamps) >= LARGEST_STAMP_NS):
+        if np.any(stamps[1:] <= stamps[:-1]) or np.any(np.abs(stamps) >= Files.LARGEST_STAMP_NS):
             raise DataError(f"{self.path / FRAMES}: the times do not increase; {AGAIN}")
 
     def _check_descriptors(self) -> None:

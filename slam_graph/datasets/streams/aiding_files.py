@@ -28,12 +28,13 @@ from pathlib import Path
 import numpy as np
 
 from slam_graph.arrays import BoolArray, FloatArray, IntArray
-from slam_graph.datasets.streams.csv_rows import LARGEST_STAMP_NS, Rows, read_rows
+from slam_graph.datasets.streams.csv_rows import Rows, read_rows
 from slam_graph.datasets.streams.geodesy import Datum, local_positions
 from slam_graph.datasets.streams.pairing import in_order
 from slam_graph.datasets.streams.vector_lengths import lengths_of
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import DataError
+from slam_graph.files import Files
 from slam_graph.sensors import AidingData, Packet
 
 FIXES, ODOMETRY, POSES = "gnss.csv", "odometry.csv", "poses.csv"
@@ -234,7 +235,7 @@ def _gga(rows: Rows, index: int) -> tuple[int, FloatArray, FloatArray]:
     nothing = np.full(3, np.nan)
     try:
         stamp_ns = int(stamp)
-        if abs(stamp_ns) >= LARGEST_STAMP_NS:
+        if abs(stamp_ns) >= Files.LARGEST_STAMP_NS:
             raise ValueError
         if cells[6] == "0" or not cells[2]:
             return stamp_ns, nothing, nothing

@@ -15,20 +15,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from slam_graph.arrays import BoolArray, FloatArray, IntArray
 from slam_graph.errors import DataError
+from slam_graph.files import Files
 
 _ROWS_PER_BLOCK = 1024
 """Rows in memory at a time: about five seconds of an IMU."""
 
 STAMP_TEXT = "S40"
 """Type of a column of stamps in seconds, kept as text until it is turned into nanoseconds."""
-
-LARGEST_STAMP_NS = 2**62
-"""Times from here on, the year 2116, are faults of a file; so differences of times fit, too."""
-
-_LARGEST = 1e18
-"""Numbers of files are no larger: their squares fit into floating-point numbers of 32 bits."""
 
 _DIGITS = frozenset("0123456789")
 
@@ -144,11 +138,6 @@ def _loadtxt(
     return table
 
 
-def are_times(stamps_ns: IntArray) -> BoolArray:
-    """Which stamps (N,) are near enough to zero to be times; so their differences fit, too."""
-    return np.asarray((stamps_ns > -LARGEST_STAMP_NS) & (stamps_ns < LARGEST_STAMP_NS), np.bool_)
-
-
 def stamp_from_seconds(text: bytes | str, rows: Rows, index: int) -> int:
     """Nanoseconds of a time in seconds written as text, exact to its last digit.
 
@@ -174,7 +163,7 @@ def nanoseconds(text: str) -> int:
         ValueError, ArithmeticError: if the text is not a time.
     """
     seconds = Decimal(text)
-    if not abs(seconds) < LARGEST_STAMP_NS // 10**9:  # NaN is an ArithmeticError
+    if not abs(seconds) < Files.LARGEST_STAMP_NS // 10**9:  # NaN is an ArithmeticError
         raise ValueError(text)
     return int((seconds * 10**9).to_integral_value())
 
@@ -188,21 +177,16 @@ def stamps_from_seconds(rows: Rows, texts: NDArray[np.bytes_]) -> NDArray[np.int
     return np.repeat(np.array(stamps, np.int64), np.diff(first, append=len(texts)))
 
 
-def refuse_wild_stamps(rows: Rows, stamps_ns: NDArray[np.int64]) -> None:
-    """Refuse stamps (N,) of `rows` whose differences do not fit into 64 bits.
+def check_times(rows: Rows, stamps_ns: NDArray[np.int64]) -> None:
+    """Refuse stamps (N,) of `rows` that are no times in ns.
 
     Raises:
         DataError: naming the line of the first.
     """
-    wild = np.flatnonzero((stamps_ns <= -LARGEST_STAMP_NS) | (stamps_ns >= LARGEST_STAMP_NS))
-    if len(wild):
-        stamp = stamps_ns[wild[0]]
-        raise DataError(f"{rows.where(int(wild[0]))}: '{stamp}' is not a time in nanoseconds")
-
-
-def measurable(values: FloatArray) -> BoolArray:
-    """Which values are finite, and not beyond any measurement."""
-    return np.asarray(np.abs(values) <= _LARGEST)
+    wrong = np.flatnonzero(~Files.are_times(stamps_ns))
+    if len(wrong):
+        stamp = stamps_ns[wrong[0]]
+        raise DataError(f"{rows.where(int(wrong[0]))}: '{stamp}' is not a time in nanoseconds")
 
 
 def require_rows(path: Path) -> None:

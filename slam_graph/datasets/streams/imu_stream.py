@@ -16,15 +16,15 @@ from numpy.typing import NDArray
 from slam_graph.arrays import IntArray
 from slam_graph.datasets.streams.csv_rows import (
     Rows,
-    are_times,
+    check_times,
     count_rows,
     read_rows,
-    refuse_wild_stamps,
     require_rows,
 )
 from slam_graph.datasets.streams.imu_outliers import without_outliers
 from slam_graph.datasets.streams.pairing import in_order
 from slam_graph.diagnostics import Diagnostics
+from slam_graph.files import Files
 from slam_graph.sensors import ImuData
 
 _GAP_PERIODS = 5.0
@@ -71,7 +71,7 @@ class _ImuCleaner:
         if self.after_ns is not None:
             wanted = data.stamps_ns >= self.after_ns
         finite = np.isfinite(data.gyro).all(axis=1) & np.isfinite(data.accel).all(axis=1)
-        finite &= are_times(data.stamps_ns)
+        finite &= Files.are_times(data.stamps_ns)
         for k in np.flatnonzero(wanted & ~finite):
             self.diagnostics.warn("imu_not_finite", f"{where(int(k))}: dropped, not finite")
         candidates = np.flatnonzero(wanted & finite)
@@ -240,5 +240,5 @@ class ImuFile:
 def parse_imu_rows(rows: Rows) -> ImuData:
     """Samples of rows (stamp in ns, gyro xyz in rad/s, accel xyz in m/s²): EuRoC's order."""
     table = rows.parse(INTEGER_STAMPS, "stamp [ns], gyro xyz, accel xyz")
-    refuse_wild_stamps(rows, table["stamp"])
+    check_times(rows, table["stamp"])
     return ImuData(table["stamp"], table["gyro"], table["accel"])

@@ -21,9 +21,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam_graph.arrays import FloatArray, IntArray
-from slam_graph.datasets.streams.csv_rows import LARGEST_STAMP_NS, read_rows
+from slam_graph.datasets.streams.csv_rows import read_rows
 from slam_graph.datasets.streams.images import decoded
 from slam_graph.errors import DataError
+from slam_graph.files import Files
 
 MASKS = "masks"
 """Name of the folder beside a recording."""
@@ -108,7 +109,7 @@ def _time_ns(path: Path) -> int | None:
     if not _TIME_NAME.fullmatch(path.stem):
         return None
     stamp_ns = int(Decimal(path.stem) * 10**9) if "." in path.stem else int(path.stem)
-    return stamp_ns if stamp_ns < LARGEST_STAMP_NS else None
+    return stamp_ns if stamp_ns < Files.LARGEST_STAMP_NS else None
 
 
 def _drawn(boxes: NDArray[np.void], size: tuple[int, int]) -> LabelImage:

@@ -13,9 +13,10 @@ from pathlib import Path
 
 import numpy as np
 
-from slam_graph.datasets.streams.csv_rows import LARGEST_STAMP_NS, read_rows
+from slam_graph.datasets.streams.csv_rows import read_rows
 from slam_graph.datasets.streams.vector_lengths import lengths_of
 from slam_graph.errors import DataError
+from slam_graph.files import Files
 from slam_graph.geometry import Trajectory
 
 OBJECT_TRUTH = "objects_truth.csv"
@@ -56,7 +57,7 @@ def read_object_truth(path: Path) -> dict[int, Trajectory]:
     for number in np.unique(table["object"]).tolist():
         rows = table[table["object"] == number]
         stamps = np.ascontiguousarray(rows["stamp"])
-        if np.any(np.diff(stamps) <= 0) or np.any(np.abs(stamps) >= LARGEST_STAMP_NS):
+        if np.any(np.diff(stamps) <= 0) or np.any(np.abs(stamps) >= Files.LARGEST_STAMP_NS):
             raise DataError(f"{path}: the times of object {number} do not increase")
         truth[number] = Trajectory(stamps, rows["position"].copy(), rows["q"].copy())
     return truth

@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam_graph.datasets.sequence import FrameStream
-from slam_graph.datasets.streams.csv_rows import measurable
 from slam_graph.diagnostics import Diagnostics
+from slam_graph.files import Files
 from slam_graph.sensors import FeatureFrame, FeatureObservations
 
 TRACK_ROW = np.dtype(
@@ -99,7 +99,9 @@ def _observations(
 ) -> FeatureObservations:
     """The observations of one camera in one frame, without unusable ones."""
     rows = table[table["camera"] == camera]
-    finite = measurable(rows["pixel"]).all(axis=1) & measurable(rows["normalized"]).all(axis=1)
+    finite = Files.are_measurable(rows["pixel"]).all(axis=1) & Files.are_measurable(
+        rows["normalized"]
+    ).all(axis=1)
     for row in rows[~finite]:
         diagnostics.warn(
             "track_not_finite", f"{where}: feature {row['id']} at {row['stamp']} dropped"
