@@ -115,7 +115,9 @@ def _withdrawn_unit(now: CameraAndGyroscope) -> float:
     for finding in now.findings:
         if finding.kind == "gyroscope_unit" and not finding.values["unit"]:
             now.findings.remove(finding)
-            return float(str(finding.values["factor"]))
+            factor = finding.values["factor"]
+            assert isinstance(factor, float)
+            return factor
     return 1.0
 
 
@@ -172,10 +174,12 @@ def _agreement(fit: RotationFit, change_s: float, sigma: dict[str, float]) -> Fi
 
 def _judge_mounting(now: CameraAndGyroscope, fit: RotationFit) -> None:
     """Whether the calibrated rotation is wrong; it is corrected then."""
-    if not _is_turned(now, fit):
-        return
     R = now.rig.cameras[0].body_T_camera.rotation().matrix()
-    away, sigmas = _turn(now, fit)
+    turn, covariance = fit.turn_from(R)
+    away = float(np.linalg.norm(turn))
+    sigmas = float(np.sqrt(turn @ np.linalg.solve(covariance, turn)))
+    if away < _TURN_RAD * _noisier(fit) or sigmas < SIGMAS:
+        return
     sigma = away / sigmas
     named = explained(fit.values.body_R_camera, R)
     if named.away_rad > max(_NAMED_RAD, 3 * sigma) or away < TURNED_RAD:
@@ -188,19 +192,6 @@ def _judge_mounting(now: CameraAndGyroscope, fit: RotationFit) -> None:
         pose = pose.inverse() if named.kind == "inverse" else by * pose
         cameras.append(replace(mounted, body_T_camera=pose))
     now.rig = replace(now.rig, cameras=tuple(cameras))
-
-
-def _turn(now: CameraAndGyroscope, fit: RotationFit) -> tuple[float, float]:
-    """Angle between the calibrated mounting and the one that was found, rad, and in deviations."""
-    R = now.rig.cameras[0].body_T_camera.rotation().matrix()
-    turn, covariance = fit.turn_from(R)
-    sigmas = float(np.sqrt(turn @ np.linalg.solve(covariance, turn)))
-    return float(np.linalg.norm(turn)), sigmas
-
-
-def _is_turned(now: CameraAndGyroscope, fit: RotationFit) -> bool:
-    away, sigmas = _turn(now, fit)
-    return away >= _TURN_RAD * _noisier(fit) and sigmas >= SIGMAS
 
 
 def _mounting_finding(named: Explanation, R: FloatArray, away: float, sigma: float) -> Finding:
@@ -272,7 +263,8 @@ def _judge_focal(now: CameraAndGyroscope, fit: RotationFit, sigma: float) -> Non
 
 
 def _is_magnified(fit: RotationFit) -> bool:
-    change, sigma = abs(float(np.log(fit.values.focal))), float(fit.sigmas[1])
+    change = abs(float(np.log(fit.values.focal)))
+    sigma = float(fit.sigmas[WITH_SCALE.index("focal")])
     return change >= max(_FOCAL * _noisier(fit), SIGMAS * sigma)
 
 

@@ -64,7 +64,7 @@ class Kinematics:
         readout_s: of the rows.
         body_R_camera: (3, 3).
         bias: (3,) of the gyroscope, rad/s.
-        scale: factor by which the gyroscope turns faster than the body, after the bias.
+        scale: of the gyroscope: measured rate - bias = scale * rate of the body.
     """
 
     offset_s: float

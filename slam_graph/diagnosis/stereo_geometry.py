@@ -129,7 +129,7 @@ def _bearings(camera: Camera, pixels: FloatArray) -> FloatArray:
 def check_stereo(matches: list[StereoMatches], rig: Rig) -> list[Finding]:
     """Findings about the first two cameras; nothing without enough matches.
 
-    A finding of exchanged cameras has a value ``exchanged``: what of them, see `mended`.
+    A finding of exchanged cameras has a value ``exchanged``: ``cameras`` or ``poses`` (`mended`).
     """
     if len(rig.cameras) < 2:
         return []
