@@ -8,8 +8,8 @@ The names below are all that most programs need. Each is imported when it is fir
     import slam_graph as sg
 
     result = sg.run("demo", algorithm="swf")
-    result.save("results/demo")
-    sg.load_result("results/demo").trajectory
+    result.save("results/mine")
+    sg.load_result("results/mine").trajectory
 """
 
 from typing import TYPE_CHECKING

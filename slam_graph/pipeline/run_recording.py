@@ -70,7 +70,7 @@ def run(
     divergence ends the run, and the result holds what was done so far and says so in `status`.
     `RunResult.check` raises what went wrong; `RunResult.save` writes the files.
 
-        run("demo", algorithm="swf").save("results/demo")
+        run("demo", algorithm="swf").save("results/mine")
 
     Args:
         recording: an open sequence (`open_dataset`), or the path or name of a recording.
