@@ -17,10 +17,12 @@ __all__ = ["Interrupts"]
 
 _GRACE_S = 10.0
 """Time for a process to end after Ctrl-C before it is killed."""
+_deferring: list[Deferred] = []
+"""Who defers signals in the main thread, the innermost last."""
 
 
 class Deferred:
-    """A handler of SIGINT that only notes the first signal; a second one takes effect at once.
+    """Notes the first SIGINT or SIGTERM; a second one takes effect at once.
 
     Attributes:
         heard: whether there was a signal.
@@ -40,18 +42,22 @@ class Deferred:
             raise KeyboardInterrupt
 
     def install(self) -> None:
-        """Take the place of the handler; not where SIGINT is ignored, as in a background job.
+        """Take the place of the handler; SIGINT stays ignored where it is, as in a background job.
 
         Outside the main thread, which alone gets signals, this changes nothing.
         """
-        main = threading.current_thread() is threading.main_thread()
-        if main and signal.getsignal(signal.SIGINT) != signal.SIG_IGN:
+        if threading.current_thread() is not threading.main_thread():
+            return
+        _deferring.append(self)
+        if signal.getsignal(signal.SIGINT) != signal.SIG_IGN:
             self._before = signal.signal(signal.SIGINT, self)
 
     def restore(self) -> None:
         """Give the place back."""
         if self._before is not None:
             signal.signal(signal.SIGINT, self._before)
+        if self in _deferring:
+            _deferring.remove(self)
 
     def check(self) -> None:
         """Let a signal that was noted take effect.
@@ -96,7 +102,7 @@ class Deferred:
 
 @contextmanager
 def completed() -> Iterator[Callable[[], None]]:
-    """Let Ctrl-C wait until the block has ended; a second one takes effect at once.
+    """Let Ctrl-C and SIGTERM wait until the block has ended; a second one takes effect at once.
 
     Yields:
         A function to call where the part of the block begins that is to be completed.
@@ -111,7 +117,7 @@ def completed() -> Iterator[Callable[[], None]]:
     finally:
         handler.restore()
     if handler.heard:
-        signal.raise_signal(signal.SIGINT)
+        _pass_on(signal.SIGINT, None)
 
 
 @contextmanager
@@ -138,7 +144,7 @@ def terminate_like_interrupt() -> None:
 
 
 def _pass_on(signum: int, frame: FrameType | None) -> None:
-    handler = signal.getsignal(signal.SIGINT)
+    handler = _deferring[-1] if _deferring else signal.getsignal(signal.SIGINT)
     if callable(handler):
         handler(signum, frame)
     else:

@@ -172,12 +172,20 @@ def test_faults_strike_in_their_order(tracks: RecordedSequence) -> None:
         ("imu_missing:at_s=2001-13-41", "at_s"),
         ("imu_missing:at_s=" + "[" * 3000, "at_s"),
         ("imu_missing:seed=" + "9" * 5000, "seed"),
+        ("imu_zeros:seed=-1", "seed"),
+        ("imu_zeros:at_s=1,at_s=2", "at_s is there twice"),
     ],
 )
 def test_wrong_texts_are_named(tracks: RecordedSequence, text: str, message: str) -> None:
     """In one line that says what there is."""
     with pytest.raises(ConfigError, match=message):
         inject(tracks, [text])
+
+
+def test_a_fault_that_never_begins_is_refused(tracks: RecordedSequence) -> None:
+    """Rather than ignored."""
+    with pytest.raises(DataError, match=r"never begins: the recording has 3\.0 s"):
+        inject(tracks, ["imu_missing:at_s=900"])
 
 
 def test_a_fault_of_a_camera_that_is_not_there_is_refused(tracks: RecordedSequence) -> None:

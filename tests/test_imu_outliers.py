@@ -130,6 +130,24 @@ def test_one_camera_leads_over_a_gap_in_a_turn(data_dir: Path) -> None:
     assert errors[1] < 2.0 * errors[0]
 
 
+@pytest.mark.parametrize("algorithm", ["msckf", "ekf", "fixed_lag_isam2"])
+def test_a_velocity_that_no_image_tells_is_not_gone_on_with(data_dir: Path, algorithm: str) -> None:
+    """One camera takes off while samples are missing, and no feature has a known depth."""
+    truth = data_dir / "euroc_inertial/V1_01_easy"
+    sequence = open_dataset("demo", groundtruth=truth, faults=["imu_missing:at_s=5,duration_s=0.5"])
+    config = load_config(algorithm=algorithm, overrides=["final_ba.enabled=false"])
+    result = run(sequence, config, duration_s=10.0)
+    assert result.status == "ok", result.message
+    known = sequence.groundtruth()
+    assert known is not None
+    before, _ = result.segments
+    assert "do not tell the velocity" in before.ended_by
+    assert (before.end_ns - result.input.start_ns) * 1e-9 < 5.0
+    for segment in result.segments:
+        part = segment.part_of(result.trajectory)
+        assert ape(known, part, alignment="yaw").statistics.rmse < 0.05
+
+
 def test_recorded_flights_have_no_outliers() -> None:
     """Not one sample of the demo is left out."""
     sequence = open_dataset("demo")

@@ -14,7 +14,7 @@ from slam_graph.config import RunConfig, load_config
 from slam_graph.datasets.dataset_registry import open_dataset
 from slam_graph.errors import DataError, EstimationError
 from slam_graph.geometry.trajectory import NavState, Trajectory, interpolate
-from slam_graph.pipeline.agreement import DivergenceError, check_sane
+from slam_graph.pipeline.divergence import DivergenceError, check_sane
 from slam_graph.pipeline.estimation import true_state
 from slam_graph.pipeline.run_recording import run
 from slam_graph.sensors.measurements import Packet

@@ -22,7 +22,8 @@ from slam_graph.config import RunConfig
 from slam_graph.datasets.faults.injection import inject
 from slam_graph.evaluation.absolute_pose_error import ape
 from slam_graph.geometry.trajectory import NavState
-from slam_graph.pipeline.agreement import Agreement, Corrections, DivergenceError
+from slam_graph.pipeline.agreement import Agreement
+from slam_graph.pipeline.divergence import Corrections, DivergenceError
 from slam_graph.pipeline.run_recording import run
 from slam_graph.results.run_result import RunResult
 from slam_graph.sensors import FeatureFrame, FeatureObservations

@@ -162,12 +162,12 @@ def test_an_interrupt_in_the_final_adjustment_keeps_the_causal_result(
         result.check()
 
 
-def signals(count: int, done: list[int]) -> None:
+def signals(count: int, done: list[int], number: signal.Signals = signal.SIGINT) -> None:
     """Send a signal so many times while something is to be completed."""
     with Interrupts.completed() as begin:
         begin()
         for _ in range(count):
-            signal.raise_signal(signal.SIGINT)
+            signal.raise_signal(number)
         done.append(count)
 
 
@@ -178,6 +178,26 @@ def test_what_has_begun_is_completed_unless_there_is_a_second_signal() -> None:
             signals(count, done)
     signals(0, done)
     assert done == [1, 0]
+
+
+@pytest.mark.parametrize("ignored", [False, True])
+def test_sigterm_waits_also_where_ctrl_c_is_ignored(ignored: bool) -> None:
+    """As in a background job of a shell."""
+    before = signal.signal(signal.SIGTERM, signal.SIG_DFL), signal.getsignal(signal.SIGINT)
+    if ignored:
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        Interrupts.terminate_like_interrupt()
+        done: list[int] = []
+        with Interrupts.deferred() as deferral:
+            signals(1, done, signal.SIGTERM)
+            assert deferral.heard
+            with pytest.raises(KeyboardInterrupt):
+                deferral.check()
+        assert done == [1]
+    finally:
+        signal.signal(signal.SIGTERM, before[0])
+        signal.signal(signal.SIGINT, before[1])
 
 
 def alive(pid: int) -> bool:

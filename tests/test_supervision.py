@@ -13,7 +13,8 @@ import pytest
 from slam_graph.backend.cost.gating import Innovations
 from slam_graph.config import RunConfig, load_config
 from slam_graph.geometry.trajectory import NavState
-from slam_graph.pipeline.agreement import Agreement, DivergenceError, check_sane
+from slam_graph.pipeline.agreement import Agreement
+from slam_graph.pipeline.divergence import DivergenceError, check_sane
 from slam_graph.pipeline.run_recording import run
 from slam_graph.results.run_result import RunResult
 from slam_graph.sensors.measurements import FeatureFrame, FeatureObservations, Packet

@@ -114,6 +114,11 @@ class EstimatorKnowledge:
         return self._context.propagation.noise.at_limit
 
     @property
+    def misses_imu(self) -> bool:
+        """Whether samples of the IMU were missing up to the last frame."""
+        return self._context.propagation.missed
+
+    @property
     def motion(self) -> FrameMotion | None:
         """The motion of the body within the last frame, where a shutter rolls."""
         window = self.window

@@ -15,7 +15,7 @@ from slam_graph.backend import Estimator
 from slam_graph.datasets import Sequence
 from slam_graph.errors import DataError
 from slam_graph.geometry import NavState, Trajectory, interpolate
-from slam_graph.pipeline.agreement import DivergenceError, check_sane
+from slam_graph.pipeline.divergence import DivergenceError, check_sane
 from slam_graph.pipeline.recovery import Recovery
 from slam_graph.pipeline.stage import EstimatedFrame
 from slam_graph.pipeline.tracking import TrackedPacket
@@ -235,6 +235,7 @@ class Estimation:
         if state is not None:
             check_sane(state, result.config)
             self._recovery.agreement.check(stamp_ns, estimator.report.innovations)
+            self._recovery.agreement.check_bridging(estimator, state)
             self._recovery.agreement.check_correction(estimator, features)
             if estimator.replayed is None:
                 self._recovery.append(estimator.states)

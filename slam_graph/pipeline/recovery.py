@@ -16,7 +16,8 @@ import numpy as np
 from slam_graph.backend import Estimator
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.geometry import NavState
-from slam_graph.pipeline.agreement import Agreement, DivergenceError, JumpError, check_sane
+from slam_graph.pipeline.agreement import Agreement
+from slam_graph.pipeline.divergence import DivergenceError, JumpError, check_sane
 from slam_graph.results import RunResult
 from slam_graph.sensors import ImuData
 

@@ -13,7 +13,7 @@ from typing import Literal
 from slam_graph.backend import Estimator
 from slam_graph.errors import SlamGraphError
 from slam_graph.interrupts import Interrupts
-from slam_graph.pipeline.agreement import DivergenceError
+from slam_graph.pipeline.divergence import DivergenceError
 from slam_graph.pipeline.stage import COMPLETED, Stage
 from slam_graph.results import RunResult
 

@@ -120,6 +120,7 @@ class Propagation:
         noise: of the IMU; it adapts to the innovations where the settings ask for it.
         aiding: fixes and odometry between the frames; None for none.
         guesses: whether the motion is a guess, without an IMU.
+        missed: whether samples were missing up to the last frame.
     """
 
     def __init__(
@@ -143,6 +144,7 @@ class Propagation:
         self._last: NavState | None = None
         self._predicted: NavState | None = None
         self._still = False
+        self.missed = False
         self._samples: ImuData | None = None
 
     def append_frame(
@@ -169,7 +171,7 @@ class Propagation:
         previous = window.state.nav_state(i, window.stamp_ns, None)
         samples = imu.between(window.stamp_ns, stamp_ns)
         bias = window.state.frames.atConstantBias(B(i))
-        missing = self._misses_samples(imu, samples)
+        missing = self.missed = self._misses_samples(imu, samples)
         pim = samples.preintegrated(bias, self._params(samples, missing))
         self._samples = samples
         predicted = previous.predicted(pim, stamp_ns)

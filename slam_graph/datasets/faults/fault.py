@@ -46,7 +46,7 @@ class Fault(Settings):
     duration_s: float = Field(1.0, gt=0.0, le=1e6)
     """How long it lasts."""
 
-    seed: int = 0
+    seed: int = Field(0, ge=0)
     """Of what is random in it."""
 
     def require(self, around: Surroundings) -> None:

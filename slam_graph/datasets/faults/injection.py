@@ -21,7 +21,7 @@ from slam_graph.datasets.sequence import (
     SequenceInfo,
 )
 from slam_graph.datasets.streams.imu_stream import clean_blocks
-from slam_graph.errors import ConfigError
+from slam_graph.errors import ConfigError, DataError
 from slam_graph.geometry import NavState, Trajectory
 from slam_graph.sensors import AidingData, ImuData
 from slam_graph.settings import ConfigTree
@@ -38,7 +38,7 @@ def inject(recording: RecordedSequence, faults: Iterable[str | Fault]) -> Record
 
     Raises:
         ConfigError: if a text names no fault, or a wrong setting of it.
-        DataError: if a fault is of a camera that is not there.
+        DataError: if a fault is of a camera that is not there, or begins after the recording's end.
     """
     found = [fault if isinstance(fault, Fault) else fault_from(fault) for fault in faults]
     return FaultySequence(recording, found) if found else recording
@@ -57,6 +57,8 @@ def fault_from(text: str) -> Fault:
         key, separator, value = (piece.strip() for piece in part.partition("="))
         if not key or not separator or not value:
             raise ConfigError(f"{where}: expected NAME:setting=value,setting=value")
+        if key in tree.values:
+            raise ConfigError(f"{where}: {key} is there twice")
         tree.values[key] = None if value == "null" else value
     return tree.validated(FAULTS[name])
 
@@ -80,10 +82,16 @@ class FaultySequence(RecordedSequence):
         self.diagnostics = recording.diagnostics
         self.recording = recording
         self.faults = list(faults)
-        start_ns = recording.info().start_ns
-        self._around = Surroundings(recording.rig, start_ns, recording.diagnostics)
+        info = recording.info()
+        self._around = Surroundings(recording.rig, info.start_ns, recording.diagnostics)
         for fault in self.faults:
             fault.require(self._around)
+            if fault.begin_ns(self._around) > info.end_ns:
+                lasts_s = (info.end_ns - info.start_ns) * 1e-9
+                raise DataError(
+                    f"a fault with at_s={fault.at_s:g} never begins: the recording has "
+                    f"{lasts_s:.1f} s; choose an earlier time"
+                )
 
     @property
     def has_groundtruth(self) -> bool:
