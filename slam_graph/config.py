@@ -77,10 +77,12 @@ class LimitsConfig(Settings):
     where its estimate is lost."""
 
     refuse_wrong_setup: bool = expert(default=True)
-    """Whether a run that waits for its first state, or for another one before a segment has lasted
-    for five seconds, is ended, after 5 s of the recording and again after 10, 20, … s, and at once
-    after a loss, when a diagnosis is certain that its calibration or units are wrong. Without it,
-    or without `backend.initialization.check_calibration`, the cause is looked for at the end."""
+    """Whether a run is ended whose calibration or units are certainly wrong, as a diagnosis finds.
+    One that waits for its first state, or for another one before a segment has lasted for five
+    seconds, is looked at after 5 s of the recording, again after 10, 20, … s, and at once after a
+    loss. One whose estimate has lasted is looked at 24 s after its start and after a loss, and is
+    ended if they are so wrong that the estimate is worth nothing. Without it, or without
+    `backend.initialization.check_calibration`, the cause is looked for at the end."""
 
     max_speed: float = expert(default=100.0, gt=0)
     """Largest plausible speed, m/s."""

@@ -4,6 +4,7 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -53,8 +54,8 @@ def with_longer_lenses(rig: Rig, factor: float = 1.1) -> Rig:
     return changed(rig, longer)
 
 
-def turned(rig: Rig) -> Rig:
-    turn = gtsam.Pose3(gtsam.Rot3.Rx(np.deg2rad(5.0)), np.zeros(3))
+def turned(rig: Rig, degrees: float = 5.0) -> Rig:
+    turn = gtsam.Pose3(gtsam.Rot3.Rx(np.deg2rad(degrees)), np.zeros(3))
     return changed(rig, lambda c: replace(c, body_T_camera=turn * c.body_T_camera))
 
 
@@ -77,8 +78,14 @@ def flown(
     sequence = simulate(
         trajectory=trajectory, duration_s=duration_s, seed=3, flight={"hover_s": 0.0}
     )
-    rig, imu = wrong(sequence.rig), sequence.imu()
-    frames = []
+    return seen_by(sequence, wrong(sequence.rig), gyro, accel)
+
+
+def seen_by(
+    sequence: RecordedSequence, rig: Rig, gyro: float = 1.0, accel: float = 1.0
+) -> RecordedSequence:
+    """The recording under another calibration, and with factors on what the IMU measures."""
+    imu, frames = sequence.imu(), []
     for frame in sequence.frames():
         assert isinstance(frame, FeatureFrame)
         seen = zip(frame.cameras, rig.cameras, strict=True)
@@ -243,6 +250,27 @@ def test_a_wrong_setup_that_starts_is_refused_where_its_estimate_is_lost(fault: 
     assert "slam-graph doctor" in result.message
     assert not result.segments.lasted
     assert result.logs.frames / 20.0 < 11.0
+
+
+@pytest.mark.data
+@pytest.mark.parametrize(
+    ("algorithm", "wrong", "named"),
+    [
+        ("msckf", partial(with_longer_lenses, factor=1.3), "calibrated focal length is"),
+        ("okvis", partial(turned, degrees=10.0), "the camera is turned by"),
+    ],
+)
+def test_a_wrong_setup_under_which_an_estimate_lasts_is_refused_after_some_seconds(
+    algorithm: str, wrong: Callable[[Rig], Rig], named: str, data_dir: Path
+) -> None:
+    """Not at the end of a recording that may be long."""
+    path = data_dir / "euroc_inertial/V2_01_easy"
+    sequence = simulate(trajectory=str(path), real_imu=True, cameras=1, duration_s=60.0, seed=0)
+    recording = seen_by(sequence, wrong(sequence.rig))
+    result = run(recording, algorithm=algorithm, overrides=CAUSAL)
+    assert result.status == "failed"
+    assert named in result.message
+    assert result.logs.frames / 20.0 < 40.0
 
 
 @pytest.mark.parametrize("at_s", [2.5, 4.5])

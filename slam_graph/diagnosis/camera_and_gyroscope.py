@@ -25,6 +25,7 @@ from slam_graph.diagnosis.fit_findings import (
     judge,
     judge_scale,
     replace_imu,
+    scaled_lenses,
 )
 from slam_graph.diagnosis.frame_pairs import FramePair, frame_pairs
 from slam_graph.diagnosis.gathering import Part
@@ -56,6 +57,8 @@ _FITS, _NOTHING_FITS = 0.3, 0.5
 FEWEST_PAIRS = 10
 CLEARLY = 1.05
 """The noise of one fit is clearly larger than that of another by this factor."""
+_LENSES = (1.0, 1.2, 1.45)
+"""Factors on the focal length with which turns of the camera are looked for."""
 _FOCAL_STARTS = np.geomspace(0.7, 1.45, 9)
 """Factors on the focal length with which a fit is compared, as it may be in a wrong minimum."""
 _SAME_MINIMUM = 0.06
@@ -73,8 +76,7 @@ def compare(rig: Rig, parts: list[Part]) -> CameraAndGyroscope:
     """
     now = CameraAndGyroscope(rig, parts, [Gyroscope(part.imu) for part in parts])
     camera = rig.cameras[0]
-    pairs = frame_pairs(now.parts, now.gyroscopes, camera)
-    turning = _turning(now, pairs)
+    pairs, turning = _by_some_lens(now)
     R = camera.body_T_camera.rotation().matrix()
     found = check_gyroscope(now.parts, pairs, R) if turning is not None else []
     found += check_accelerometer(now.parts, now.gyroscopes, turning is not None)
@@ -142,6 +144,20 @@ def _calibration_is_better(problem: RotationProblem, start: Kinematics, fit: Rot
         return True
     misfits = [problem.misfit(values, fit.noise_px) for values in (at, fit.values)]
     return misfits[0] <= misfits[1]
+
+
+def _by_some_lens(now: CameraAndGyroscope) -> tuple[list[FramePair], Turning | None]:
+    """Pairs of frames, and how the camera turns by the calibrated lens or a longer one.
+
+    By one that is far too short many features of a wide lens are beyond its edge.
+    """
+    for factor in _LENSES:
+        camera = scaled_lenses(now.rig, factor).cameras[0]
+        pairs = frame_pairs(now.parts, now.gyroscopes, camera)
+        turning = _turning(now, pairs)
+        if turning is not None or len(pairs) < FEWEST_PAIRS:
+            break
+    return pairs, turning
 
 
 def _turning(now: CameraAndGyroscope, pairs: list[FramePair]) -> Turning | None:

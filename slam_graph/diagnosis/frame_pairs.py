@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -13,7 +13,7 @@ from slam_graph.arrays import FloatArray
 from slam_graph.backend import visual_rotation
 from slam_graph.diagnosis.gathering import Part
 from slam_graph.diagnosis.gyroscope import Gyroscope
-from slam_graph.sensors import FeatureFrame, RigCamera
+from slam_graph.sensors import Camera, FeatureFrame, FeatureObservations, RigCamera
 
 _LONGEST_S = 0.45
 """Time between the frames of a pair; shorter if they share too few features."""
@@ -34,7 +34,7 @@ class FramePair:
         part: number of the part of the recording.
         first_s, second_s: times on the camera's clock, since the start of the part's gyroscope.
         first, second: (N, 2) pixels.
-        turn: (3,) rotation vector of first_R_second of the camera by the calibrated lens; None
+        turn: (3,) rotation vector of first_R_second of the camera by the lens; None
             where the features do not show it, or it is not asked for.
     """
 
@@ -54,7 +54,7 @@ def frame_pairs(
     Args:
         parts: with frames.
         gyroscopes: of the parts.
-        camera: the first one.
+        camera: the first one, whose lens need not be the one that undistorted the features.
         turns: whether to look how the camera turns by the features alone, which takes most time.
     """
     chosen = []
@@ -97,8 +97,8 @@ def _pair(
     _, i, j = np.intersect1d(a.ids, b.ids, assume_unique=True, return_indices=True)
     found = None
     if mounted is not None:
-        with np.errstate(all="ignore"):  # beyond the edge of a wide lens
-            found = visual_rotation(a, b, mounted.camera, _PIXEL_SIGMA, None)
+        lens = mounted.camera
+        found = visual_rotation(_by_lens(a, lens), _by_lens(b, lens), lens, _PIXEL_SIGMA, None)
     turn = None if found is None else Rotation.from_matrix(found.R).as_rotvec()
     times = gyroscope.seconds(np.array([one.stamp_ns, two.stamp_ns]))
     step = max(1, len(i) // _FEATURES)
@@ -106,3 +106,10 @@ def _pair(
     return FramePair(
         number, float(times[0]), float(times[1]), a.pixels[i[rows]], b.pixels[j[rows]], turn
     )
+
+
+def _by_lens(seen: FeatureObservations, lens: Camera) -> FeatureObservations:
+    """The observations under a lens, without those beyond its edge."""
+    with np.errstate(all="ignore"):
+        normalized, known = lens.visible(seen.pixels)
+    return replace(seen, normalized=normalized).select(known)

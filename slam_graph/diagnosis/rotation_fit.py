@@ -46,6 +46,8 @@ _DIRECTIONS = 4
 """How often a direction is found again without wrong matches."""
 _BLOCK_S = 2.0
 """Errors within so long count as one."""
+_BEYOND = 10.0
+"""Epipolar distance of a feature beyond the edge of a wide lens, in units of the noise."""
 _LEAST_PX = 0.05
 """No noise is smaller than this."""
 _PIXEL_STEPS = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
@@ -190,11 +192,11 @@ class RotationProblem:
             scaled = replace(camera, fx=camera.fx * focal, fy=camera.fy * focal)
             moved = self._pixels[None] + _PIXEL_STEPS[:, None, None, None]
             with np.errstate(all="ignore"):  # beyond the edge of a wide lens
-                m = scaled.undistort(moved.reshape(-1, 2)).reshape(moved.shape)
-                rays = np.concatenate([m, np.ones((*m.shape[:-1], 1))], axis=-1)
-                rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
-            known = self._there & np.all(np.isfinite(rays), axis=(0, 1, 4))
-            rays = np.where(np.isfinite(rays), rays, 0.0)
+                points, visible = scaled.visible(moved.reshape(-1, 2))
+            m = points.reshape(moved.shape)
+            rays = np.concatenate([m, np.ones((*m.shape[:-1], 1))], axis=-1)
+            rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
+            known = self._there & np.all(visible.reshape(m.shape[:-1]), axis=(0, 1))
             slopes = np.stack([rays[1] - rays[0], rays[2] - rays[0]], axis=-1)
             if len(self._bearings) > 4:
                 self._bearings.clear()
@@ -253,9 +255,8 @@ class RotationProblem:
 
     def noise_px(self, at: Kinematics) -> float:
         """Robust standard deviation of the epipolar distances, the directions fitted."""
-        e = self.distances(at, self.directions(at, _LEAST_PX))
-        known = self.bearings(at.focal)[2]
-        return _noise(e[known]) if known.any() else np.inf
+        e = self._distances_of_all(at, self.directions(at, _LEAST_PX), np.inf)
+        return _noise(e) if len(e) else np.inf
 
     def misfit(self, at: Kinematics, noise: float) -> float:
         """How badly all features fit together: minus their robust logarithmic likelihood.
@@ -264,9 +265,18 @@ class RotationProblem:
             at: values of the unknowns.
             noise: standard deviation of the epipolar distances, pixels.
         """
-        e = self.distances(at, self.directions(at, noise))
-        squares = np.log1p((e[self.bearings(at.focal)[2]] / (_CAUCHY * noise)) ** 2)
+        e = self._distances_of_all(at, self.directions(at, noise), _BEYOND * noise)
+        squares = np.log1p((e / (_CAUCHY * noise)) ** 2)
         return 0.5 * _CAUCHY**2 * float(np.sum(squares))
+
+    def _distances_of_all(self, at: Kinematics, t: FloatArray, beyond_px: float) -> FloatArray:
+        """Epipolar distances of all features, in one row; this one for those without a bearing.
+
+        They must not count as if they fitted: a focal length that puts them beyond the edge of a
+        wide lens would look better for each of them.
+        """
+        known = self.bearings(at.focal)[2]
+        return np.asarray(np.where(known, self.distances(at, t), beyond_px)[self._there])
 
     def solve(
         self,
@@ -322,7 +332,9 @@ class RotationProblem:
         for c, k in enumerate(columns):
             change = np.zeros(len(WITH_SCALE))
             change[k] = _STEP[k]
-            J[..., c] = (self.distances(at.moved(change), t) - e) / _STEP[k]
+            moved = at.moved(change)
+            J[..., c] = (self.distances(moved, t) - e) / _STEP[k]
+            known = known & self.bearings(moved.focal)[2]
         # beyond the edge of a wide lens there is no bearing, so that a distance jumps in a step
         most = _JUMP * self._mounted.camera.fx / _LARGEST[columns]
         steady = np.all(np.abs(J) < most, axis=-1, keepdims=True)

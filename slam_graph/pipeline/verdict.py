@@ -14,7 +14,7 @@ from __future__ import annotations
 import logging
 import math
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from typing import TYPE_CHECKING
 
@@ -29,6 +29,7 @@ from slam_graph.sensors import CameraFrame, FeatureFrame, ImuData, Rig
 
 if TYPE_CHECKING:
     from slam_graph.diagnosis import Diagnosis
+    from slam_graph.diagnosis.finding import Finding
 
 _KEPT_NS = 24_000_000_000
 """So much of the recording is looked at: what came after the start, as far as it goes."""
@@ -38,6 +39,10 @@ _FIRST_LOOK_NS = 5_000_000_000
 """A run that has waited so long for a start is looked at, and again after twice that."""
 _HINDERING = {"gyroscope_scale": 0.1, "baseline": 0.3}
 """Logarithms of factors from which these keep a run from starting; smaller ones only harm it."""
+_RUINING = {"focal_length": 0.2, "gyroscope_scale": 0.1, "baseline": 0.3}
+"""Those from which an estimate that goes on is worth nothing."""
+_RUINING_DEG = 6.0
+"""The same for a turn of the cameras."""
 _FAILED = ("not_initialized", "diverged", "low_coverage")
 _DOUBTS = ("start_corrected", "new_segment", "scale_unknown")
 """Warnings after which an estimate that came to its end is doubted."""
@@ -50,11 +55,17 @@ and more where cameras are mounted side by side."""
 logger = logging.getLogger(__name__)
 
 
-def _hinders(kind: str, values: Mapping[str, object]) -> bool:
-    """Whether a fault of so large a factor keeps a run from starting."""
-    factor = values.get("factor")
-    least = _HINDERING.get(kind, 0.0)
-    return not isinstance(factor, float) or abs(math.log(factor)) >= least
+def _hinders(finding: Finding, least: Mapping[str, float] = _HINDERING) -> bool:
+    """Whether the factor of a fault, if it has one, is so large that a run cannot start."""
+    factor = finding.values.get("factor")
+    return not isinstance(factor, float) or abs(math.log(factor)) >= least.get(finding.kind, 0.0)
+
+
+def _ruins(finding: Finding) -> bool:
+    """Whether a fault makes an estimate worth nothing, though it goes on."""
+    turned = finding.values.get("degrees")
+    large = not isinstance(turned, float) or turned >= _RUINING_DEG
+    return large and _hinders(finding, _RUINING)
 
 
 class _Memory:
@@ -138,6 +149,8 @@ class Verdict(Stage):
         self._kept = _Memory(len(rig.cameras) > 1, objects)
         self._clocks = ClockWatch(result, objects, diagnostics) if rig.has_imu else None
         self._estimated = self._at_limit = 0  # frames with a state; noise of the IMU at its limit
+        self._looked: Diagnosis | None = None  # a quick look at all that is kept
+        self._look_failed = False
         self._started_ns: int | None = None
         self._waits_since_ns: int | None = None
         self._look_ns = 0  # time of waiting after which the recording is looked at next
@@ -149,14 +162,15 @@ class Verdict(Stage):
         """Keep a frame, unless there are enough after the start, and watch the clocks.
 
         Raises:
-            DataError: if the run waits for a start, its estimate has never lasted, and what it was
-                given is certainly wrong.
+            DataError: if what the run was given is certainly wrong, so that it cannot start, or its
+                estimate is worth nothing.
         """
         stamp_ns = frame.features.stamp_ns
         if self._clocks is not None:
             self._clocks.add(frame)
         if frame.restarted:
             self._estimated = self._at_limit = 0
+            self._looked = None
         self._estimated += frame.initialized
         self._at_limit += frame.initialized and frame.imu_noise_at_limit
         if frame.restarted or not frame.initialized:
@@ -164,11 +178,12 @@ class Verdict(Stage):
         elif self._started_ns is None:
             self._started_ns = stamp_ns
         elif stamp_ns > self._started_ns + _KEPT_NS:
+            self._watch_full()
             return
         self._kept.add(frame)
         if frame.initialized:
             self._waits_since_ns = None
-        elif self._refuses and not self._result.segments.lasted:
+        elif self._refuses:
             self._watch_start(stamp_ns, frame.corrected_rig or self._result.input.rig)
 
     def finish(self) -> None:
@@ -230,17 +245,35 @@ class Verdict(Stage):
         if waited_ns < self._look_ns:
             return
         self._look_ns = max(2 * self._look_ns, _FIRST_LOOK_NS)
+        waited = f"no start in {waited_ns * 1e-9:.1f} s"
+        if lost:
+            waited = f"the estimate was lost{', ' + waited if waited_ns else ''}"
+        self._refuse(waited, rig, _ruins if self._result.segments.lasted else _hinders)
+
+    def _watch_full(self) -> None:
+        """Look once whether the estimate is worth anything, when all that is looked at is there.
+
+        Raises:
+            DataError: if what the run was given is certainly wrong, and by so much.
+        """
+        if self._looked is not None or self._look_failed:
+            return
+        self._look_failed = True
+        with warn_on_failure(self._diagnostics, "diagnosis_failed", "the cause is not looked for"):
+            self._looked, self._look_failed = self._nearby(self._final_rig()), False
+        if self._refuses and self._looked is not None and self._looked.setup_faults:
+            self._refuse("the estimate is wrong", self._final_rig(), _ruins)
+
+    def _refuse(self, why: str, rig: Rig, matters: Callable[[Finding], bool]) -> None:
+        """Raise DataError if what the run was given is certainly wrong, where that matters."""
         causes = ""
         with warn_on_failure(self._diagnostics, "diagnosis_failed", "the cause is not looked for"):
-            causes = self._certain_causes(rig)
+            causes = self._certain_causes(rig, matters)
         if causes:
-            waited = f"no start in {waited_ns * 1e-9:.1f} s"
-            if lost:
-                waited = f"the estimate was lost{', ' + waited if waited_ns else ''}"
-            raise DataError(f"{waited}: {causes}; see `slam-graph doctor`")
+            raise DataError(f"{why}: {causes}; see `slam-graph doctor`")
 
-    def _certain_causes(self, rig: Rig) -> str:
-        """What is certainly wrong, and is neither estimated nor corrected in a start."""
+    def _certain_causes(self, rig: Rig, matters: Callable[[Finding], bool]) -> str:
+        """What matters, is certainly wrong, and neither estimated nor corrected in a start."""
         if not rig.cameras[0].rotation_known:
             return ""
         calibration = self._result.config.backend.calibration
@@ -253,7 +286,7 @@ class Verdict(Stage):
         certain = [
             finding
             for finding in found
-            if not estimated.get(finding.kind, False) and _hinders(finding.kind, finding.values)
+            if not estimated.get(finding.kind, False) and matters(finding)
         ]
         return "; or ".join([f.with_fix for f in certain[:1]] + [f.what for f in certain[1:2]])
 
@@ -317,8 +350,6 @@ class Verdict(Stage):
 
     def _is_doubtful(self) -> bool:
         """Whether something shows that a good recording hardly ever shows."""
-        from slam_graph.diagnosis import Diagnosis  # it takes a moment to import
-
         counts, tested = self._diagnostics.counts, self._result.logs.innovations.columns()
         rejected = float(tested["rejected"].sum()) / max(float(tested["tested"].sum()), 1.0)
         if rejected > _MAX_REJECTED or any(counts[kind] for kind in _DOUBTS):
@@ -326,7 +357,14 @@ class Verdict(Stage):
         kept = self._kept
         if kept.pairs and kept.shared < _FEWEST_SHARED:
             return True
-        looked = Diagnosis.nearby(
-            self._final_rig(), kept.frames, kept.imu, self._result.segments.losses
-        )
-        return bool(looked.setup_faults)
+        estimated = self._result.logs.calibration.latest is not None
+        if self._looked is None or estimated:
+            self._looked = self._nearby(self._final_rig())
+        return bool(self._looked.setup_faults)
+
+    def _nearby(self, rig: Rig) -> Diagnosis:
+        """A quick look at what was recorded."""
+        from slam_graph.diagnosis import Diagnosis  # it takes a moment to import
+
+        kept = self._kept
+        return Diagnosis.nearby(rig, kept.frames, kept.imu, self._result.segments.losses)
