@@ -17,7 +17,7 @@ from slam_graph.frontend.extraction import BORDER_PX, FeatureExtractor
 from slam_graph.frontend.frontend_config import FrontendConfig
 from slam_graph.frontend.keypoints import Image, Pixels, Tracks
 from slam_graph.frontend.prediction import Prediction, neighbour_flow
-from slam_graph.kernels.window_tracking import WINDOW_PX, track_level
+from slam_graph.kernels.window_tracking import WINDOW_PX, halved, halvings_room, track_windows
 
 _ITERATIONS = 15
 """Most iterations on each level of the pyramid; few are needed from a good prediction."""
@@ -55,7 +55,8 @@ class Flow:
     Attributes:
         points: (N, 2) float32 pixels in the other image.
         found: (N,) whether Lucas-Kanade converged inside the image, forward and back.
-        error_px: (N,) distance between a point and itself after tracking it forward and back.
+        error_px: (N,) distance between a point and itself after tracking it forward and back;
+            of no meaning where it was not found.
     """
 
     points: Pixels
@@ -63,25 +64,34 @@ class Flow:
     error_px: NDArray[np.float32]
 
 
-class _Pyramids:
-    """The halvings of the images that were tracked last.
+class _Pyramid:
+    """The halvings of an image, made when they are needed.
 
     Args:
-        count: how many images are in use at a time.
+        image: which must not change.
+        levels: most of them.
+
+    Attributes:
+        image: as the kernel wants it.
+        halvings: one behind another.
     """
 
-    def __init__(self, count: int) -> None:
-        self._latest: deque[tuple[Image, list[Image]]] = deque(maxlen=count)
+    def __init__(self, image: Image, levels: int) -> None:
+        self._of = image
+        self.image = np.require(image, requirements=("C", "W"))
+        self.halvings: Image = np.empty(halvings_room(image.shape, levels), np.uint8)
+        self._made = 0
 
-    def level(self, image: Image, level: int) -> Image:
-        """A level of the pyramid of an image, which must not change; 0 is the image itself."""
-        pyramid = next((levels for one, levels in self._latest if one is image), None)
-        if pyramid is None:
-            pyramid = [np.require(image, requirements=("C", "W"))]  # as the kernel wants it
-            self._latest.append((image, pyramid))
-        while len(pyramid) <= level:
-            pyramid.append(np.asarray(cv2.pyrDown(pyramid[-1]), np.uint8))
-        return pyramid[level]
+    def is_of(self, image: Image) -> bool:
+        """Whether it is that of an image."""
+        return image is self._of
+
+    def reach(self, levels: int) -> None:
+        """Make so many levels, if they are not there."""
+        for level in range(self._made, levels):
+            smaller = halved(self.image, self.halvings, level + 1)
+            cv2.pyrDown(halved(self.image, self.halvings, level), smaller)
+        self._made = max(self._made, levels)
 
 
 class LucasKanade:
@@ -94,7 +104,8 @@ class LucasKanade:
 
     def __init__(self, config: FrontendConfig, images: int) -> None:
         self._window_px = config.window_px
-        self._pyramids = _Pyramids(images)
+        self._levels = max(config.pyramid_levels, _GUIDED_LEVELS)
+        self._pyramids: deque[_Pyramid] = deque(maxlen=images)
 
     def flow(
         self, source: Image, target: Image, points: Pixels, guess: Pixels, levels: int
@@ -110,45 +121,43 @@ class LucasKanade:
         """
         if len(points) == 0:
             return Flow(points, np.zeros(0, np.bool_), np.zeros(0, np.float32))
-        forward, found = self._lucas_kanade(source, target, points, guess, levels)
-        found &= inside(forward, target.shape, BORDER_PX)
-        # The way back starts where it should end, so it needs no pyramid: what it tests is whether
-        # the patch that was found is, seen from the other side, the patch that was looked for.
-        back, returned = self._lucas_kanade(target, source, forward, points, _BACKWARD_LEVELS)
-        error_px = np.linalg.norm(back - points, axis=1)
-        return Flow(forward, found & returned, error_px)
-
-    def _lucas_kanade(
-        self, source: Image, target: Image, points: Pixels, start: Pixels, levels: int
-    ) -> tuple[Pixels, BoolArray]:
-        """Where points (N, 2) are in another image, and whether they were found (N,)."""
         if self._window_px != WINDOW_PX:
-            return self._by_opencv(source, target, points, start, levels)
+            return self._flow_by_opencv(source, target, points, guess, levels)
         while levels > 0 and -(-min(source.shape) >> levels) <= WINDOW_PX:
             levels -= 1  # a level, of a size rounded up, must be larger than the window
+        one, other = self._pyramid(source, levels), self._pyramid(target, levels)
         points = np.ascontiguousarray(points, np.float32)
-        moved = np.ascontiguousarray(start, np.float32) / np.float32(1 << levels)
-        found = np.ones(len(points), np.bool_)
-        for level in range(levels, -1, -1):
-            track_level(
-                self._pyramids.level(source, level),
-                self._pyramids.level(target, level),
-                points,
-                moved,
-                found,
-                level,
-                _ITERATIONS,
-                _STEP_PX,
-                _MIN_EIGENVALUE,
+        start = np.ascontiguousarray(guess, np.float32)
+        return Flow(
+            *track_windows(
+                *(one.image, one.halvings, other.image, other.halvings, points, start, levels),
+                *(BORDER_PX, _ITERATIONS, _STEP_PX, _MIN_EIGENVALUE),
             )
-            if level > 0:
-                moved *= np.float32(2.0)
-        return moved, found
+        )
+
+    def _pyramid(self, image: Image, levels: int) -> _Pyramid:
+        """The pyramid of an image, with at least so many levels."""
+        found = next((pyramid for pyramid in self._pyramids if pyramid.is_of(image)), None)
+        if found is None:
+            found = _Pyramid(image, max(levels, self._levels))
+            self._pyramids.append(found)
+        found.reach(levels)
+        return found
+
+    def _flow_by_opencv(
+        self, source: Image, target: Image, points: Pixels, guess: Pixels, levels: int
+    ) -> Flow:
+        """The same for windows of any size, in more time."""
+        forward, found = self._by_opencv(source, target, points, guess, levels)
+        found &= inside(forward, target.shape, BORDER_PX)
+        back, returned = self._by_opencv(target, source, forward, points, _BACKWARD_LEVELS)
+        error_px = np.linalg.norm(back - points, axis=1)
+        return Flow(forward, found & returned, error_px)
 
     def _by_opencv(
         self, source: Image, target: Image, points: Pixels, start: Pixels, levels: int
     ) -> tuple[Pixels, BoolArray]:
-        """The same for windows of any size, in more time."""
+        """Where points (N, 2) are in another image, and whether they were found (N,)."""
         moved, status, _ = cv2.calcOpticalFlowPyrLK(
             source,
             target,

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""Lucas-Kanade on one level of a pyramid (Bouguet 2000).
+"""Pyramidal Lucas-Kanade, forth and back (Bouguet 2000, Kalal et al. 2010).
 
 OpenCV's `calcOpticalFlowPyrLK` builds the pyramids and derivatives of both images in every call.
 Here pyramids are given, and derivatives are taken where they are needed. Positions, weights of 14
@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from slam_graph.arrays import BoolArray, IntArray
 from slam_graph.kernels.compilation import compiled
 
-__all__ = ["WINDOW_PX", "track_level", "track_level_numpy"]
+__all__ = ["WINDOW_PX", "halved", "halvings_room", "track_windows", "track_windows_numpy"]
 
 WINDOW_PX = 17
 """Side of the window."""
@@ -54,7 +54,9 @@ _at = np.uintp
 """An index without a sign. Numba would test others for negative ones, and not use vectors."""
 
 _Image = NDArray[np.uint8]
+_Halvings = NDArray[np.uint8]
 _Window = NDArray[np.int16]
+_Errors = NDArray[np.float32]
 _Pixels = NDArray[np.float32]
 _Weights = tuple[np.int32, np.int32, np.int32, np.int32]
 
@@ -155,8 +157,8 @@ def _sums(
     return np.float32(total_x) * _SCALE, np.float32(total_y) * _SCALE
 
 
-@compiled("void(u1[:, ::1], u1[:, ::1], f4[:, ::1], f4[:, ::1], b1[::1], i8, i8, f8, f4)")
-def track_level(
+@compiled()
+def _track_level(
     source: _Image,
     target: _Image,
     points: _Pixels,
@@ -239,7 +241,144 @@ def track_level(
             good[i] &= level > 0
 
 
-def track_level_numpy(
+@compiled()
+def _level(image: _Image, halvings: _Halvings, level: int) -> _Image:
+    """A level of a pyramid: the image itself, or one of its halvings, which lie behind another."""
+    if level == 0:
+        return image
+    height, width, begin = (image.shape[0] + 1) // 2, (image.shape[1] + 1) // 2, 0
+    for _ in range(level - 1):
+        begin += height * width
+        height, width = (height + 1) // 2, (width + 1) // 2
+    return halvings[begin : begin + height * width].reshape((height, width))
+
+
+@compiled(
+    "Tuple((f4[:, ::1], b1[::1], f4[::1]))(u1[:, ::1], u1[::1], u1[:, ::1], u1[::1], f4[:, ::1], "
+    "f4[:, ::1], i8, i8, i8, f8, f4)"
+)
+def track_windows(
+    source: _Image,
+    source_halvings: _Halvings,
+    target: _Image,
+    target_halvings: _Halvings,
+    points: _Pixels,
+    start: _Pixels,
+    levels: int,
+    border_px: int,
+    iterations: int,
+    step_px: float,
+    least_eigenvalue: float,
+) -> tuple[_Pixels, BoolArray, _Errors]:
+    """Find points of one image in another, and those that were found in the first one again.
+
+    The way back begins where it should end, so it needs no pyramid: what it tests is whether the
+    window that was found is, seen from the other side, the window that was looked for.
+
+    Args:
+        source: (height, width) the one image.
+        source_halvings: its halvings one behind another, at least `levels` of them.
+        target: the other image, of the same size.
+        target_halvings: those of the other image.
+        points: (N, 2) pixels in `source`.
+        start: (N, 2) where to begin in `target`.
+        levels: of the pyramid that are used beside the image itself.
+        border_px: what lies nearer to the edge of `target` is not found.
+        iterations: most steps on a level.
+        step_px: a step that is not longer than this is the last one on its level.
+        least_eigenvalue: smallest eigenvalue of the moments of the gradient, per pixel.
+
+    Returns:
+        points: (N, 2) pixels in `target`.
+        found: (N,) whether there are such, forth and back.
+        error_px: (N,) distance of a point to itself after both ways; infinite if it was not found.
+    """
+    n = len(points)
+    moved, found = np.empty((n, 2), np.float32), np.ones(n, np.bool_)
+    scale = np.float32(1.0) / np.float32(1 << levels)
+    for i in range(n):
+        moved[i, 0], moved[i, 1] = start[i, 0] * scale, start[i, 1] * scale
+    for level in range(levels, -1, -1):
+        one, other = _level(source, source_halvings, level), _level(target, target_halvings, level)
+        _track_level(one, other, points, moved, found, level, iterations, step_px, least_eigenvalue)
+        for i in range(n if level > 0 else 0):
+            moved[i, 0], moved[i, 1] = np.float32(2.0) * moved[i, 0], np.float32(2.0) * moved[i, 1]
+    height, width = target.shape
+    rows = np.empty(n, np.int64)
+    count = 0
+    for i in range(n):
+        u, v = moved[i, 0], moved[i, 1]
+        found[i] &= u >= border_px and u <= width - 1 - border_px
+        found[i] &= v >= border_px and v <= height - 1 - border_px
+        rows[count] = i
+        count += found[i]
+    ends, back = np.empty((count, 2), np.float32), np.empty((count, 2), np.float32)
+    returned, error_px = np.ones(count, np.bool_), np.full(n, np.inf, np.float32)
+    for k in range(count):
+        i = rows[k]
+        ends[k, 0], ends[k, 1] = moved[i, 0], moved[i, 1]
+        back[k, 0], back[k, 1] = points[i, 0], points[i, 1]
+    _track_level(target, source, ends, back, returned, 0, iterations, step_px, least_eigenvalue)
+    for k in range(count):
+        i = rows[k]
+        found[i] = returned[k]
+        if returned[k]:
+            du, dv = back[k, 0] - points[i, 0], back[k, 1] - points[i, 1]
+            error_px[i] = np.sqrt(du * du + dv * dv)
+    return moved, found, error_px
+
+
+def track_windows_numpy(
+    source: _Image,
+    source_halvings: _Halvings,
+    target: _Image,
+    target_halvings: _Halvings,
+    points: _Pixels,
+    start: _Pixels,
+    levels: int,
+    border_px: int,
+    iterations: int,
+    step_px: float,
+    least_eigenvalue: float,
+) -> tuple[_Pixels, BoolArray, _Errors]:
+    """`track_windows` in NumPy."""
+    moved, found = start / np.float32(1 << levels), np.ones(len(points), np.bool_)
+    limits = iterations, step_px, least_eigenvalue
+    for level in range(levels, -1, -1):
+        one, other = halved(source, source_halvings, level), halved(target, target_halvings, level)
+        _track_level_numpy(one, other, points, moved, found, level, *limits)
+        moved = moved * np.float32(2.0 if level > 0 else 1.0)
+    last = np.array(target.shape[::-1]) - 1 - border_px
+    found &= np.all((moved >= border_px) & (moved <= last), axis=1)
+    rows = np.flatnonzero(found)
+    back, returned = points[rows], np.ones(len(rows), np.bool_)
+    _track_level_numpy(target, source, moved[rows], back, returned, 0, *limits)
+    found[rows] = returned
+    error_px = np.full(len(points), np.inf, np.float32)
+    error_px[rows[returned]] = np.linalg.norm(back - points[rows], axis=1)[returned]
+    return moved, found, error_px
+
+
+def halvings_room(shape: tuple[int, ...], levels: int) -> int:
+    """Bytes of so many halvings of an image of a shape (height, width)."""
+    return sum(-(-shape[0] >> level) * -(-shape[1] >> level) for level in range(1, levels + 1))
+
+
+def halved(image: _Image, halvings: _Halvings, level: int) -> _Image:
+    """A level of a pyramid, as a view: the image itself, or one of its halvings.
+
+    Args:
+        image: (height, width).
+        halvings: one behind another.
+        level: 0 is the image.
+    """
+    if level == 0:
+        return image
+    begin, end = halvings_room(image.shape, level - 1), halvings_room(image.shape, level)
+    return halvings[begin:end].reshape(-(-image.shape[0] >> level), -(-image.shape[1] >> level))
+
+
+def _track_level_numpy(
     source: _Image,
     target: _Image,
     points: _Pixels,
@@ -250,7 +389,7 @@ def track_level_numpy(
     step_px: float,
     least_eigenvalue: float,
 ) -> None:
-    """`track_level` in NumPy."""
+    """`_track_level` in NumPy."""
     half, scale = np.float32((WINDOW_PX - 1) * 0.5), np.float32(1.0 / (1 << level))
     reach, size = WINDOW_PX + 1, np.array(source.shape[::-1])
     grey, others = (
