@@ -25,7 +25,10 @@ class SlamGraphError(Exception):
     exit_code: ClassVar[int] = 1
 
     def __str__(self) -> str:
-        line = " ".join(super().__str__().splitlines())  # it may quote a file from anywhere
+        # it may quote a file from anywhere: no other lines, and nothing that steers a terminal
+        line = " ".join(super().__str__().splitlines())
+        if not line.isprintable():
+            line = "".join(c if c.isprintable() else ascii(c)[1:-1] for c in line)
         return line if len(line) <= _LONGEST else f"{line[:_LONGEST]} …"
 
 

@@ -374,3 +374,9 @@ def test_bytes_that_are_no_text_are_refused(tmp_path: Path) -> None:
             with pytest.raises(SlamGraphError) as caught:
                 read(path)
             assert "\n" not in str(caught.value)
+
+
+def test_what_files_say_does_not_steer_a_terminal() -> None:
+    """An error is one line of printable characters, whatever name or value it quotes."""
+    said = str(DataError("topic '/a\0\x1b[2Jb' of \udc80\nanother line, in µm"))
+    assert said == r"topic '/a\x00\x1b[2Jb' of \udc80 another line, in µm"

@@ -196,4 +196,5 @@ def _raise_failures(failures: dict[str, str]) -> None:
 
     if failures:
         name, reason = next(iter(failures.items()))
-        raise DataError(f"{len(failures)} tasks could not be done; the first: {name}: {reason}")
+        several = f"{len(failures)} tasks could not be done; the first: "
+        raise DataError(f"{several if len(failures) > 1 else ''}{name}: {reason}")
