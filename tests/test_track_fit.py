@@ -25,21 +25,40 @@ def flight(request: pytest.FixtureRequest) -> RecordedSequence:
     return simulate(trajectory="figure8", cameras=request.param, duration_s=6.0, seed=2)
 
 
-def fits(flight: RecordedSequence, shift: Shift, scale: float = 1.0) -> list[Fit]:
-    """Fits along the true flight, displaced by a function of the time in s."""
+def still(_: float) -> FloatArray:
+    return np.zeros(3)
+
+
+def fits(
+    flight: RecordedSequence, shift: Shift, scale: float = 1.0, measured: Shift | None = None
+) -> list[Fit]:
+    """Fits along the true flight, displaced by a function of the time in s.
+
+    Args:
+        flight: with its tracks.
+        shift: of the reported poses.
+        scale: standard deviation of the observations.
+        measured: what of it the IMU has measured; not known if not given.
+    """
     truth = flight.groundtruth()
     assert truth is not None
     frames = [f for f in flight.frames() if isinstance(f, FeatureFrame)]
     stamps = np.array([frame.stamp_ns for frame in frames])
     near, valid = interpolate(truth, stamps)
     track_fit, found = TrackFit(scale), []
+    before_s = 0.0
     for k, frame in enumerate(np.array(frames, object)[valid]):
         t = (frame.stamp_ns - stamps[0]) * 1e-9
         pose = gtsam.Pose3(near.pose(k).rotation(), near.positions[k] + shift(t))
         state = NavState(
             frame.stamp_ns, pose, np.zeros(3), accel_bias=np.zeros(3), gyro_bias=np.zeros(3)
         )
-        fit = track_fit.add(state, frame, flight.rig, scale, NONE)
+        predicted = None
+        if measured is not None:
+            corrected = shift(t) - shift(before_s) - (measured(t) - measured(before_s))
+            predicted = gtsam.Pose3(pose.rotation(), pose.translation() - corrected)
+        before_s = t
+        fit = track_fit.add(state, frame, flight.rig, scale, NONE, None, predicted)
         if fit is not None:
             found.append(fit)
     return found
@@ -69,6 +88,16 @@ def test_a_jump_is_found_once_and_only_where_it_is(flight: RecordedSequence) -> 
     assert len(at) == 1
     step_s = 6.0 / len(found)
     assert JUMP_S < (at[0] + 1) * step_s < JUMP_S + 1.3
+
+
+def test_an_estimate_that_corrects_itself_does_not_jump(flight: RecordedSequence) -> None:
+    """The IMU has measured nothing of it."""
+
+    def shift(t: float) -> FloatArray:
+        return np.array([0.5, -0.3, 0.4]) * (t > JUMP_S)
+
+    assert not any(fit.jumped for fit in fits(flight, shift, measured=still))
+    assert sum(fit.jumped for fit in fits(flight, shift, measured=shift)) == 1
 
 
 def test_a_pose_that_is_wrong_for_a_moment_is_no_jump(flight: RecordedSequence) -> None:

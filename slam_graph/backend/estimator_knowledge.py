@@ -119,6 +119,11 @@ class EstimatorKnowledge:
         return self._context.propagation.missed
 
     @property
+    def predicted(self) -> gtsam.Pose3 | None:
+        """The last frame's pose by the IMU alone, from the estimate before; None if unknown."""
+        return self._context.propagation.predicted
+
+    @property
     def motion(self) -> FrameMotion | None:
         """The motion of the body within the last frame, where a shutter rolls."""
         window = self.window

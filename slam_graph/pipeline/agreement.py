@@ -110,7 +110,8 @@ class Agreement:
         if state is None or solved is None:
             return
         known = estimator.rig_now, estimator.assumed_noise_px, estimator.dynamic
-        found = self._fit.add(state, solved, *known, estimator.motion)
+        predicted = estimator.predicted if solved is frame else None
+        found = self._fit.add(state, solved, *known, estimator.motion, predicted)
         if found is None:
             return
         revised = estimator.aiding.was_revised(state.stamp_ns)

@@ -147,6 +147,13 @@ class Propagation:
         self.missed = False
         self._samples: ImuData | None = None
 
+    @property
+    def predicted(self) -> gtsam.Pose3 | None:
+        """The last frame's pose by the IMU alone, from the estimate before; None if unknown."""
+        if self._predicted is None or self.guesses or self.missed:
+            return None
+        return self._predicted.world_T_body
+
     def append_frame(
         self,
         window: Window,

@@ -10,7 +10,9 @@ are right the reprojection errors have the size of the noise; no covariance of a
 choice of features can hide that they are not.
 
 A platform that is put somewhere else moves on there as the IMU says, if it is at rest or its
-velocity and tilt are the same. Then tracks fit before and after, and none fits across.
+velocity and tilt are the same. Then tracks fit before and after, and none fits across. An estimate
+that corrects itself jumps in the same way, so it is no jump if tracks fit across it by the motion
+that the IMU measures from each frame to the next, which has no corrections.
 """
 
 from __future__ import annotations
@@ -19,6 +21,7 @@ from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import gtsam
 import numpy as np
 
 from slam_graph.arrays import FloatArray, IntArray
@@ -73,12 +76,20 @@ class Fit:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Pose:
-    """The pose that was reported for a frame of the window."""
+    """The pose that was reported for a frame of the window.
+
+    Attributes:
+        stamp_ns: time of the frame.
+        index: of the frame.
+        reported: rotation (3, 3) and position (3,).
+        carried: the same without the corrections since the first frame.
+        motion: of the body within the frame.
+    """
 
     stamp_ns: int
     index: int
-    rotation: FloatArray
-    position: FloatArray
+    reported: tuple[FloatArray, FloatArray]
+    carried: tuple[FloatArray, FloatArray]
     motion: FrameMotion | None
 
 
@@ -99,6 +110,8 @@ class TrackFit:
         self._good: int | None = None  # the last frame that was good
         self._bad = 0  # in how many frames right after it nearly no track fitted
         self._telling = False
+        self._latest: gtsam.Pose3 | None = None
+        self._carried = gtsam.Pose3()
 
     def add(
         self,
@@ -108,6 +121,7 @@ class TrackFit:
         sigma_px: float,
         moving: IntArray,
         motion: FrameMotion | None = None,
+        predicted: gtsam.Pose3 | None = None,
     ) -> Fit | None:
         """Take the next frame.
 
@@ -118,15 +132,18 @@ class TrackFit:
             sigma_px: standard deviation of the observations.
             moving: ids (N,) of features that move by themselves, ascending.
             motion: of the body within the frame, for rolling shutters.
+            predicted: the pose by the IMU alone, from the one that was reported for the frame
+                before; None where that is not known.
 
         Returns:
             How the tracks compare; None if it is too early for the next comparison.
         """
         now_ns = state.stamp_ns
+        self._carry(state.world_T_body, predicted)
         if self._poses and now_ns < self._poses[-1].stamp_ns + _STEP_NS - _UNEVEN_NS:
             return None
         T, now = state.world_T_body, self._count
-        self._poses.append(_Pose(now_ns, now, T.rotation().matrix(), T.translation(), motion))
+        self._poses.append(_Pose(now_ns, now, _parts(T), _parts(self._carried), motion))
         self._tracks.add(now, frame)
         self._count += 1
         while self._poses[0].stamp_ns < now_ns - _SPAN_NS - _UNEVEN_NS:
@@ -154,6 +171,13 @@ class TrackFit:
             self._telling = sigma_px <= self._usual_px
         return Fit(len(ids), unfit, jumped and told, lost and told, self._telling)
 
+    def _carry(self, reported: gtsam.Pose3, predicted: gtsam.Pose3 | None) -> None:
+        """Go on from frame to frame as the IMU says, or as was reported where that is not known."""
+        if self._latest is not None:
+            step = self._latest.between(reported if predicted is None else predicted)
+            self._carried = self._carried * step
+        self._latest = reported
+
     def _jumped(
         self, ids: IntArray, before: int, projection: RigProjection, limit_px: float
     ) -> bool:
@@ -165,10 +189,17 @@ class TrackFit:
             return False
         across = self._errors(ids, projection) >= limit_px
         fits = self._errors(ids, projection, after) < limit_px
-        return bool(min(np.mean(across), np.mean(fits)) >= _JUMPED_SHARE)
+        if min(np.mean(across), np.mean(fits)) < _JUMPED_SHARE:
+            return False
+        carried = self._errors(ids, projection, carried=True) >= limit_px
+        return bool(np.mean(carried) >= _JUMPED_SHARE)
 
     def _errors(
-        self, ids: IntArray, projection: RigProjection, frames: Sequence[int] | None = None
+        self,
+        ids: IntArray,
+        projection: RigProjection,
+        frames: Sequence[int] | None = None,
+        carried: bool = False,
     ) -> FloatArray:
         """Reprojection errors (J,) of tracks (ids ascending), each as large as its noise, px.
 
@@ -176,14 +207,21 @@ class TrackFit:
             ids: of them.
             projection: of the rig.
             frames: those that count; all if none are given.
+            carried: whether poses are those without the corrections.
         """
         obs = self._tracks.observations(ids, frames)
         if len(obs) == 0:
             return np.zeros(0)
-        poses = [pose for pose in self._poses if pose.index in obs.frames]
-        R = np.array([pose.rotation for pose in poses])
-        p = np.array([pose.position for pose in poses])
+        used = [pose for pose in self._poses if pose.index in obs.frames]
+        poses = [pose.carried if carried else pose.reported for pose in used]
+        R = np.array([rotation for rotation, _ in poses])
+        p = np.array([position for _, position in poses])
         found = triangulate(obs, projection, R, p, _THRESHOLDS)
         dof = np.maximum(2 * obs.counts - _POINT_DIM, 1)
         errors: FloatArray = found.reprojection_px * np.sqrt(obs.counts / dof)
         return np.where(np.isfinite(errors), errors, np.inf)
+
+
+def _parts(pose: gtsam.Pose3) -> tuple[FloatArray, FloatArray]:
+    """Rotation (3, 3) and position (3,)."""
+    return pose.rotation().matrix(), pose.translation()
