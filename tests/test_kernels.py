@@ -43,6 +43,7 @@ from slam_graph.kernels.gate import (
     track_distances,
     track_distances_numpy,
 )
+from slam_graph.kernels.halvings import halved, halvings_room
 from slam_graph.kernels.near_pairs import near_pairs, near_pairs_numpy
 from slam_graph.kernels.null_space import triangularize_features, triangularize_features_numpy
 from slam_graph.kernels.patch_search import most_similar, most_similar_numpy
@@ -64,13 +65,8 @@ from slam_graph.kernels.spacing import (
 )
 from slam_graph.kernels.state_rows import fill_state_rows, fill_state_rows_numpy
 from slam_graph.kernels.track_motion import motion_steps, motion_steps_numpy
-from slam_graph.kernels.window_tracking import (
-    WINDOW_PX,
-    halved,
-    halvings_room,
-    track_windows,
-    track_windows_numpy,
-)
+from slam_graph.kernels.window_tracking import WINDOW_PX, track_windows
+from slam_graph.kernels.window_tracking_numpy import track_windows_numpy
 from slam_graph.sensors import Camera
 from slam_graph.sensors.camera_model import CameraModel
 from slam_graph.sensors.lens_models import RadialTangential

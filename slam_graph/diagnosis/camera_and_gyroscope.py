@@ -30,12 +30,9 @@ from slam_graph.diagnosis.fit_findings import (
 from slam_graph.diagnosis.frame_pairs import FramePair, frame_pairs
 from slam_graph.diagnosis.gathering import Part
 from slam_graph.diagnosis.gyroscope import Gyroscope
+from slam_graph.diagnosis.kinematics import Kinematics
 from slam_graph.diagnosis.mountings import axes_text, explained
-from slam_graph.diagnosis.rotation_fit import (
-    Kinematics,
-    RotationFit,
-    RotationProblem,
-)
+from slam_graph.diagnosis.rotation_fit import RotationFit, RotationProblem
 from slam_graph.diagnosis.turning import Turning, coarse_turning
 from slam_graph.sensors import Rig, RigCamera
 

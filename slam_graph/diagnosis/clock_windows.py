@@ -29,7 +29,8 @@ from slam_graph.diagnosis.gathering import (
     uninterrupted,
 )
 from slam_graph.diagnosis.gyroscope import Gyroscope
-from slam_graph.diagnosis.rotation_fit import Kinematics, RotationFit, RotationProblem
+from slam_graph.diagnosis.kinematics import Kinematics
+from slam_graph.diagnosis.rotation_fit import RotationFit, RotationProblem
 from slam_graph.sensors import FeatureFrame, ImuData, Rig, RigCamera
 
 _LEAST_RATE = 0.05

@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.diagnosis.gyroscope import Gyroscope
-from slam_graph.diagnosis.rotation_fit import Kinematics
+from slam_graph.diagnosis.kinematics import Kinematics
 from slam_graph.sensors import FeatureFrame, Rig
 
 _FEATURES, _FEWEST_FRAMES = 50, 5

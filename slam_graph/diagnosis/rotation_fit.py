@@ -24,6 +24,7 @@ from scipy.spatial.transform import Rotation
 from slam_graph.arrays import BoolArray, FloatArray, median, skew
 from slam_graph.diagnosis.frame_pairs import FramePair
 from slam_graph.diagnosis.gyroscope import Gyroscope
+from slam_graph.diagnosis.kinematics import Kinematics
 from slam_graph.sensors import RigCamera
 
 UNKNOWNS = ("offset", "focal", "readout", "rx", "ry", "rz", "bx", "by", "bz")
@@ -54,38 +55,6 @@ _PIXEL_STEPS = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
 """Pixels moved for the derivatives of bearings."""
 _LEAST_VARIANCE = 0.01
 """Of t · n, as a part of the largest one: towards an epipole distances tell nothing."""
-
-
-@dataclass(frozen=True, eq=False)
-class Kinematics:
-    """Values of the unknowns.
-
-    Attributes:
-        offset_s: t_imu = t_camera + offset, of the middle row.
-        focal: factor on the calibrated focal lengths.
-        readout_s: of the rows.
-        body_R_camera: (3, 3).
-        bias: (3,) of the gyroscope, rad/s.
-        scale: of the gyroscope: measured rate - bias = scale * rate of the body.
-    """
-
-    offset_s: float
-    focal: float
-    readout_s: float
-    body_R_camera: FloatArray
-    bias: FloatArray
-    scale: float = 1.0
-
-    def moved(self, by: FloatArray) -> Kinematics:
-        """With a change (10,) in the order of `WITH_SCALE`; mountings turn in the camera frame."""
-        return Kinematics(
-            self.offset_s + float(by[0]),
-            self.focal * float(np.exp(by[1])),
-            self.readout_s + float(by[2]),
-            self.body_R_camera @ Rotation.from_rotvec(by[3:6]).as_matrix(),
-            self.bias + by[6:9],
-            self.scale * float(np.exp(by[9])),
-        )
 
 
 @dataclass(frozen=True, eq=False)

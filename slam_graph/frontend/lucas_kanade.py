@@ -17,7 +17,8 @@ from slam_graph.frontend.extraction import BORDER_PX, FeatureExtractor
 from slam_graph.frontend.frontend_config import FrontendConfig
 from slam_graph.frontend.keypoints import Image, Pixels, Tracks
 from slam_graph.frontend.prediction import Prediction, neighbour_flow
-from slam_graph.kernels.window_tracking import WINDOW_PX, halved, halvings_room, track_windows
+from slam_graph.kernels.halvings import halved, halvings_room
+from slam_graph.kernels.window_tracking import WINDOW_PX, track_windows
 
 _ITERATIONS = 15
 """Most iterations on each level of the pyramid; few are needed from a good prediction."""

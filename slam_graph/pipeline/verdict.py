@@ -29,7 +29,6 @@ from slam_graph.sensors import CameraFrame, FeatureFrame, ImuData, Rig
 
 if TYPE_CHECKING:
     from slam_graph.diagnosis import Diagnosis
-    from slam_graph.diagnosis.finding import Finding
 
 _KEPT_NS = 24_000_000_000
 """So much of the recording is looked at: what came after the start, as far as it goes."""
@@ -55,17 +54,23 @@ and more where cameras are mounted side by side."""
 logger = logging.getLogger(__name__)
 
 
-def _hinders(finding: Finding, least: Mapping[str, float] = _HINDERING) -> bool:
+_Matters = Callable[[str, Mapping[str, object]], bool]
+"""Whether a fault matters, by its kind and its values."""
+
+
+def _hinders(
+    kind: str, values: Mapping[str, object], least: Mapping[str, float] = _HINDERING
+) -> bool:
     """Whether the factor of a fault, if it has one, is so large that a run cannot start."""
-    factor = finding.values.get("factor")
-    return not isinstance(factor, float) or abs(math.log(factor)) >= least.get(finding.kind, 0.0)
+    factor = values.get("factor")
+    return not isinstance(factor, float) or abs(math.log(factor)) >= least.get(kind, 0.0)
 
 
-def _ruins(finding: Finding) -> bool:
+def _ruins(kind: str, values: Mapping[str, object]) -> bool:
     """Whether a fault makes an estimate worth nothing, though it goes on."""
-    turned = finding.values.get("degrees")
+    turned = values.get("degrees")
     large = not isinstance(turned, float) or turned >= _RUINING_DEG
-    return large and _hinders(finding, _RUINING)
+    return large and _hinders(kind, values, _RUINING)
 
 
 class _Memory:
@@ -264,7 +269,7 @@ class Verdict(Stage):
         if self._refuses and self._looked is not None and self._looked.setup_faults:
             self._refuse("the estimate is wrong", self._final_rig(), _ruins)
 
-    def _refuse(self, why: str, rig: Rig, matters: Callable[[Finding], bool]) -> None:
+    def _refuse(self, why: str, rig: Rig, matters: _Matters) -> None:
         """Raise DataError if what the run was given is certainly wrong, where that matters."""
         causes = ""
         with warn_on_failure(self._diagnostics, "diagnosis_failed", "the cause is not looked for"):
@@ -272,7 +277,7 @@ class Verdict(Stage):
         if causes:
             raise DataError(f"{why}: {causes}; see `slam-graph doctor`")
 
-    def _certain_causes(self, rig: Rig, matters: Callable[[Finding], bool]) -> str:
+    def _certain_causes(self, rig: Rig, matters: _Matters) -> str:
         """What matters, is certainly wrong, and neither estimated nor corrected in a start."""
         if not rig.cameras[0].rotation_known:
             return ""
@@ -286,7 +291,7 @@ class Verdict(Stage):
         certain = [
             finding
             for finding in found
-            if not estimated.get(finding.kind, False) and matters(finding)
+            if not estimated.get(finding.kind, False) and matters(finding.kind, finding.values)
         ]
         return "; or ".join([f.with_fix for f in certain[:1]] + [f.what for f in certain[1:2]])
 
