@@ -11,12 +11,15 @@ from __future__ import annotations
 import difflib
 from collections.abc import Iterable
 from typing import ClassVar
+from unicodedata import category
 
 __all__ = ["ConfigError", "DataError", "EstimationError", "SlamGraphError", "closest"]
 
 
 _LONGEST = 1500
 """Characters of a message that are shown."""
+_UNSEEN = ("Cc", "Cf", "Cs", "Co", "Cn", "Zl", "Zp")
+"""Categories of characters that are shown by their code: they control, or have no form."""
 
 
 class SlamGraphError(Exception):
@@ -28,7 +31,7 @@ class SlamGraphError(Exception):
         # it may quote a file from anywhere: no other lines, and nothing that steers a terminal
         line = " ".join(super().__str__().splitlines())
         if not line.isprintable():
-            line = "".join(c if c.isprintable() else ascii(c)[1:-1] for c in line)
+            line = "".join(ascii(c)[1:-1] if category(c) in _UNSEEN else c for c in line)
         return line if len(line) <= _LONGEST else f"{line[:_LONGEST]} …"
 
 

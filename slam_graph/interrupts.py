@@ -48,16 +48,16 @@ class Deferred:
         """
         if threading.current_thread() is not threading.main_thread():
             return
-        _deferring.append(self)
         if signal.getsignal(signal.SIGINT) != signal.SIG_IGN:
             self._before = signal.signal(signal.SIGINT, self)
+        _deferring.append(self)
 
     def restore(self) -> None:
         """Give the place back."""
-        if self._before is not None:
-            signal.signal(signal.SIGINT, self._before)
         if self in _deferring:
             _deferring.remove(self)
+        if self._before is not None:
+            signal.signal(signal.SIGINT, self._before)
 
     def check(self) -> None:
         """Let a signal that was noted take effect.
@@ -130,8 +130,8 @@ def deferred() -> Iterator[Deferred]:
         Its `check` raises KeyboardInterrupt after a Ctrl-C; `at_once` lets it take effect.
     """
     handler = Deferred()
-    handler.install()
     try:
+        handler.install()
         yield handler
     finally:
         handler.restore()

@@ -186,6 +186,9 @@ def test_a_fault_that_never_begins_is_refused(tracks: RecordedSequence) -> None:
     """Rather than ignored."""
     with pytest.raises(DataError, match=r"never begins: the recording has 3\.0 s"):
         inject(tracks, ["imu_missing:at_s=900"])
+    inject(tracks, ["clock_jump:at_s=1,by_s=20", "imu_missing:at_s=22"])  # they follow each other
+    with pytest.raises(DataError, match="ImuMissing with at_s=22"):
+        inject(tracks, ["imu_missing:at_s=22", "clock_jump:at_s=1,by_s=20"])
 
 
 def test_a_fault_of_a_camera_that_is_not_there_is_refused(tracks: RecordedSequence) -> None:

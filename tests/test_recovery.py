@@ -23,7 +23,7 @@ from slam_graph.datasets.faults.injection import inject
 from slam_graph.evaluation.absolute_pose_error import ape
 from slam_graph.geometry.trajectory import NavState
 from slam_graph.pipeline.agreement import Agreement
-from slam_graph.pipeline.divergence import Corrections, DivergenceError
+from slam_graph.pipeline.divergence import Bridging, Corrections, DivergenceError
 from slam_graph.pipeline.run_recording import run
 from slam_graph.results.run_result import RunResult
 from slam_graph.sensors import FeatureFrame, FeatureObservations
@@ -334,3 +334,40 @@ def test_a_window_in_a_moved_world_knows_the_same() -> None:
         for w in (window, other)
     ]
     assert costs[0] == pytest.approx(costs[1], rel=1e-12)
+
+
+def of_velocity(seconds: float, sigma: float) -> NavState:
+    """A state whose velocity is known to so many m/s."""
+    covariance = np.diag(np.repeat([1e-6, 1e-6, sigma**2, 1e-6, 1e-6], 3))
+    zero = np.zeros(3)
+    return NavState(
+        round(seconds * 1e9),
+        gtsam.Pose3(),
+        zero,
+        gyro_bias=zero,
+        accel_bias=zero,
+        covariance=covariance,
+    )
+
+
+def test_a_velocity_that_stays_unknown_after_missing_samples_is_a_loss() -> None:
+    """From the last state before they were missing on."""
+    bridging = Bridging()
+    for k, (sigma, missed) in enumerate([(0.01, False), (1.0, True), (2.0, True), (2.0, False)]):
+        bridging.check(of_velocity(0.1 * k, sigma), missed)
+    assert bridging.agreed_until() is None  # another loss keeps its own time
+    for k in (4, 5):
+        bridging.check(of_velocity(0.1 * k, 2.0), False)
+    with pytest.raises(DivergenceError, match="do not tell the velocity"):
+        bridging.check(of_velocity(0.6, 2.0), False)
+    assert len(bridging) == 1
+    assert bridging.agreed_until() == 0
+
+
+@pytest.mark.parametrize("before", [0.01, 1.0])
+def test_a_velocity_known_soon_or_as_well_as_before_is_none(before: float) -> None:
+    bridging = Bridging()
+    bridging.check(of_velocity(0.0, before), False)
+    for k in range(1, 30):  # samples are missing again and again
+        bridging.check(of_velocity(0.1 * k, 2.0 if k % 3 == 1 else before), k % 3 == 1)
+    assert len(bridging) == 0

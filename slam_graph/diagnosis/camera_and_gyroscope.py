@@ -115,6 +115,8 @@ def refine(rig: Rig, parts: list[Part]) -> CameraAndGyroscope:
         return now
     start = _calibrated(camera)
     problem = RotationProblem(pairs, now.gyroscopes, camera)
+    if not np.isfinite(problem.noise_px(start)):  # most features are beyond the edge of the lens
+        return compare(rig, parts)
     try:
         now.fit = problem.solve(start)
     except np.linalg.LinAlgError:
@@ -152,9 +154,14 @@ def _by_some_lens(now: CameraAndGyroscope) -> tuple[list[FramePair], Turning | N
         camera = scaled_lenses(now.rig, factor).cameras[0]
         pairs = frame_pairs(now.parts, now.gyroscopes, camera)
         turning = _turning(now, pairs)
-        if turning is not None or len(pairs) < FEWEST_PAIRS:
+        if turning is not None or len(pairs) < FEWEST_PAIRS or _sees_all(camera, pairs):
             break
     return pairs, turning
+
+
+def _sees_all(camera: RigCamera, pairs: list[FramePair]) -> bool:
+    """Whether no feature is beyond the edge of a lens."""
+    return bool(np.all(camera.camera.visible(np.vstack([pair.first for pair in pairs]))[1]))
 
 
 def _turning(now: CameraAndGyroscope, pairs: list[FramePair]) -> Turning | None:

@@ -242,7 +242,7 @@ def _track_level(
 
 @compiled()
 def _level(image: _Image, halvings: _Halvings, level: int) -> _Image:
-    """A level of a pyramid: the image itself, or one of its halvings, which lie behind another."""
+    """As `halvings.halved`, which is not in this file: the image itself or a halving."""
     if level == 0:
         return image
     height, width, begin = (image.shape[0] + 1) // 2, (image.shape[1] + 1) // 2, 0

@@ -10,15 +10,18 @@ from numpy.typing import NDArray
 
 from slam_graph.arrays import BoolArray, IntArray
 from slam_graph.kernels.halvings import halved
-from slam_graph.kernels.window_tracking import WINDOW_PX
+from slam_graph.kernels.window_tracking import (
+    _IMAGE_BITS,
+    _ONE,
+    _OSCILLATION_PX,
+    _SCALE,
+    _SINGULAR,
+    _WEIGHT_BITS,
+    _WHOLE,
+    WINDOW_PX,
+)
 
 __all__ = ["track_windows_numpy"]
-
-_WEIGHT_BITS, _IMAGE_BITS = 14, 9
-_ONE, _WHOLE = np.float32(1.0), np.float32(1 << _WEIGHT_BITS)
-_SCALE = np.float32(1.0 / (1 << 20))
-_SINGULAR = np.float32(np.finfo(np.float32).eps)
-_OSCILLATION_PX = 0.01
 
 _Image = NDArray[np.uint8]
 _Halvings = NDArray[np.uint8]

@@ -19,11 +19,13 @@ from slam_graph.errors import EstimationError
 from slam_graph.geometry import NavState
 from slam_graph.sensors import FeatureFrame
 
-_KNOWN_VELOCITY = 0.5
-"""Largest standard deviation of a velocity, m/s, at the second frame with samples of the IMU again.
-Where features have known depths it is below 0.05 then, and 2 to 10 where they have none."""
-_SAMPLED_FRAMES = 2
-"""GTSAM's smoothers take what a frame sees with the next frame, so the first one knows no more."""
+_KNOWN_VELOCITY, _LESS_KNOWN = 0.5, 3.0
+"""Standard deviation of a velocity, m/s, and by how much it may exceed that before samples of the
+IMU were missing, once there are samples again. Where features have known depths it is below 0.05
+soon, and 2 to 10 where they have none."""
+_SAMPLED_FRAMES = 4
+"""It is unknown if none of so many frames with samples knows it. GTSAM's smoothers take what a
+frame sees with the next one."""
 _LONGEST_GAP_S = 0.5
 """A gap between two frames whose features were tested counts as at most this much time."""
 
@@ -245,13 +247,14 @@ class Bridging:
     """
 
     def __init__(self) -> None:
-        self._last_ns: int | None = None
-        self._before_ns: int | None = None
+        self._last: tuple[int, float] | None = None  # time and sigma of the last state
+        self._before: tuple[int, float] | None = None  # the same before samples were missing
         self._sampled = 0
+        self._agreed_ns: int | None = None
 
     def __len__(self) -> int:
-        """How many such times are not over."""
-        return 0 if self._before_ns is None else 1
+        """One if the velocity was found unknown."""
+        return 0 if self._agreed_ns is None else 1
 
     def check(self, state: NavState, missed: bool) -> None:
         """Add the next state.
@@ -261,24 +264,27 @@ class Bridging:
             missed: whether samples were missing since the state before.
 
         Raises:
-            DivergenceError: if samples are there again, and the velocity is not known.
+            DivergenceError: if there are samples again, and the velocity is not known.
         """
+        if state.covariance is None:
+            return
+        sigma = math.sqrt(float(np.linalg.eigvalsh(state.covariance[6:9, 6:9])[-1]))
         if missed:
-            self._before_ns = self._last_ns if self._before_ns is None else self._before_ns
+            self._before = self._last if self._before is None else self._before
             self._sampled = 0
-        self._last_ns = state.stamp_ns
-        if missed or self._before_ns is None:
+        self._last = state.stamp_ns, sigma
+        if missed or self._before is None:
             return
         self._sampled += 1
-        if self._sampled < _SAMPLED_FRAMES:
-            return
-        if state.covariance is not None:
-            sigma = math.sqrt(float(np.linalg.eigvalsh(state.covariance[6:9, 6:9])[-1]))
-            if sigma > _KNOWN_VELOCITY:
-                lost = f"lost at frame {state.stamp_ns}: IMU samples were missing, and images"
-                raise DivergenceError(f"{lost} do not tell the velocity (σ of {sigma:.2g} m/s)")
-        self._before_ns = None
+        if sigma <= max(_KNOWN_VELOCITY, _LESS_KNOWN * self._before[1]):
+            self._before = None
+        elif self._sampled >= _SAMPLED_FRAMES:
+            self._agreed_ns = self._before[0]
+            raise DivergenceError(
+                f"lost at frame {state.stamp_ns}: IMU samples were missing, and images do not tell "
+                f"the velocity (σ of {sigma:.2g} m/s)"
+            )
 
     def agreed_until(self) -> int | None:
-        """Time of the last state before samples were missing."""
-        return self._before_ns
+        """Time of the last state before samples were missing; None without."""
+        return self._agreed_ns

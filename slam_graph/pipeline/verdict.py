@@ -5,7 +5,8 @@
 A run with a wrong calibration may come to its end, with errors that nothing in it shows. So every
 run is followed by a quick look at the tracks after its start, and one that failed, was not smooth,
 or contradicts that look, by a diagnosis. If that finds a fault in what the run was given, the run
-is `suspect`, whatever it has estimated. A run that does not start is looked at while it waits.
+is `suspect`, whatever it has estimated. A run that does not start is looked at while it waits, and
+one that goes on 24 s after its start, when all frames are there that are looked at.
 The time offset between camera and IMU is watched over the whole run, as it may change later on.
 """
 
@@ -61,16 +62,17 @@ _Matters = Callable[[str, Mapping[str, object]], bool]
 def _hinders(
     kind: str, values: Mapping[str, object], least: Mapping[str, float] = _HINDERING
 ) -> bool:
-    """Whether the factor of a fault, if it has one, is so large that a run cannot start."""
+    """Whether the factor of a fault, if it has one, is so large; by default, that none starts."""
     factor = values.get("factor")
     return not isinstance(factor, float) or abs(math.log(factor)) >= least.get(kind, 0.0)
 
 
 def _ruins(kind: str, values: Mapping[str, object]) -> bool:
     """Whether a fault makes an estimate worth nothing, though it goes on."""
-    turned = values.get("degrees")
-    large = not isinstance(turned, float) or turned >= _RUINING_DEG
-    return large and _hinders(kind, values, _RUINING)
+    if kind == "mounting":
+        turned = values.get("degrees")
+        return isinstance(turned, float) and turned >= _RUINING_DEG
+    return kind in _RUINING and _hinders(kind, values, _RUINING)
 
 
 class _Memory:
@@ -150,6 +152,7 @@ class Verdict(Stage):
     ) -> None:
         self._result, self._diagnostics = result, diagnostics
         objects = objects or NoObjects()
+        self._estimates_objects = type(objects) is not NoObjects
         rig = result.input.rig
         self._kept = _Memory(len(rig.cameras) > 1, objects)
         self._clocks = ClockWatch(result, objects, diagnostics) if rig.has_imu else None
@@ -175,7 +178,7 @@ class Verdict(Stage):
             self._clocks.add(frame)
         if frame.restarted:
             self._estimated = self._at_limit = 0
-            self._looked = None
+            self._looked, self._look_failed = None, False
         self._estimated += frame.initialized
         self._at_limit += frame.initialized and frame.imu_noise_at_limit
         if frame.restarted or not frame.initialized:
@@ -244,7 +247,8 @@ class Verdict(Stage):
         if self._waits_since_ns is None:
             losses = self._result.segments.losses
             # what the loss was is left out only where it is known when it began
-            known = lost and bool(losses) and stamp_ns - losses[-1][1] < _FIRST_LOOK_NS
+            known = lost and not self._result.segments.lasted
+            known = known and bool(losses) and stamp_ns - losses[-1][1] < _FIRST_LOOK_NS
             self._waits_since_ns, self._look_ns = stamp_ns, 0 if known else _FIRST_LOOK_NS
         waited_ns = stamp_ns - self._waits_since_ns
         if waited_ns < self._look_ns:
@@ -362,8 +366,8 @@ class Verdict(Stage):
         kept = self._kept
         if kept.pairs and kept.shared < _FEWEST_SHARED:
             return True
-        estimated = self._result.logs.calibration.latest is not None
-        if self._looked is None or estimated:
+        changed = self._estimates_objects or self._result.logs.calibration.latest is not None
+        if self._looked is None or changed:  # more is known now of calibration or of what moves
             self._looked = self._nearby(self._final_rig())
         return bool(self._looked.setup_faults)
 

@@ -84,14 +84,15 @@ class FaultySequence(RecordedSequence):
         self.faults = list(faults)
         info = recording.info()
         self._around = Surroundings(recording.rig, info.start_ns, recording.diagnostics)
+        end = np.array([info.end_ns], np.int64)
         for fault in self.faults:
             fault.require(self._around)
-            if fault.begin_ns(self._around) > info.end_ns:
-                lasts_s = (info.end_ns - info.start_ns) * 1e-9
+            if fault.begin_ns(self._around) > end[0]:
                 raise DataError(
-                    f"a fault with at_s={fault.at_s:g} never begins: the recording has "
-                    f"{lasts_s:.1f} s; choose an earlier time"
+                    f"{type(fault).__name__} with at_s={fault.at_s:g} never begins: the recording "
+                    f"has {(end[0] - info.start_ns) * 1e-9:.1f} s; choose an earlier time"
                 )
+            end = fault.stamped(end, self._around)
 
     @property
     def has_groundtruth(self) -> bool:
