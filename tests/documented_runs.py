@@ -167,7 +167,7 @@ class Session:
 
 
 def shortened(words: list[str]) -> list[str]:
-    """A command whose simulation or comparison is short, with few seeds and faults that come soon."""
+    """A command whose simulation or comparison is short, with few seeds and early faults."""
     made = [re.sub(r"\bat_s=[\d.]+", "at_s=1", word) for word in words]
     if "--seeds" in made:
         at = made.index("--seeds") + 1
