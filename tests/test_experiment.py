@@ -113,6 +113,7 @@ def test_every_algorithm_is_in_the_report_with_its_numbers(simulated: tuple[Path
         assert 50.0 < row["peak_memory_mb"] < 1000.0
     markdown = (folder / "report.md").read_text()
     html = (folder / "report.html").read_text()
+    assert "world of fixes [m]" not in markdown + html  # there are none
     for name in ("msckf", "swf"):
         assert f"| {name} |" in markdown
         assert f"<td>{name}</td>" in html

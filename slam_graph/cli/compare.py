@@ -157,7 +157,7 @@ _SHOWN = {
     "peak MB": "MB",
     "status": "status",
 }
-"""Columns of the table that are printed, and their titles there; the report has all."""
+"""Columns of the table that are printed, and their titles there; the report has more."""
 
 _MEANINGS = {
     "ATE [m]": "ATE, rot.: root mean square errors, aligned in what nothing measured.",
@@ -175,7 +175,7 @@ def _echo(table: list[tuple[str, ...]]) -> None:
     tables = [_informative([titles, *(row for row in rows if row[0] == name)]) for name in names]
     printed = {title for shown in tables for title in shown[0]}
     meanings = [text for title, text in _MEANINGS.items() if title in printed]
-    caption = " ".join([*meanings, "The report has all columns."])
+    caption = " ".join([*meanings, "The report has more columns."])
     for name, shown in zip(names, tables, strict=True):
         echo_rich_table(shown[0], shown[1:], name, caption=caption if name == names[-1] else "")
 

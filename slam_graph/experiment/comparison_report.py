@@ -60,7 +60,8 @@ _EXPLANATION = (
     "gate, is 1; gated is the share that did not pass. Steps are accepted Gauss-Newton steps per "
     "frame. Milliseconds are those of the back end per frame; the column after gives their median "
     "in the first and last third of the frames, between which a growing cost shows. Numbers are "
-    "means over the seeds whose runs have status ok; peak memory is the maximum."
+    "means over the seeds whose runs have status ok; peak memory is the maximum. Columns without a "
+    "number are left out."
 )
 
 _STYLE = (
@@ -194,12 +195,20 @@ def _average(values: Iterable[float]) -> float | None:
     return float(np.mean(finite)) if finite else None
 
 
+def _table_of(rows: list[Table], name: str) -> list[tuple[str, ...]]:
+    """Titles and rows of one data set, without the columns that have no number there."""
+    cells = [_COLUMNS, *(_cells(row) for row in rows if row["data"] == name)]
+    columns = [column for column in zip(*cells, strict=True) if set(column[1:]) != {"-"}]
+    return list(zip(*columns, strict=True))
+
+
 def _markdown(comparison: Comparison, rows: list[Table], figures: dict[str, list[Figure]]) -> str:
     lines = ["# Comparison of algorithms", "", _EXPLANATION, ""]
     for name, drawn in figures.items():
-        lines += [f"## {name}", "", _markdown_line(_COLUMNS)]
-        lines += [_markdown_line(("---",) + ("---:",) * (len(_COLUMNS) - 2) + ("---",))]
-        lines += [_markdown_line(_cells(row)) for row in rows if row["data"] == name]
+        titles, *cells = _table_of(rows, name)
+        lines += [f"## {name}", "", _markdown_line(titles)]
+        lines += [_markdown_line(("---",) + ("---:",) * (len(titles) - 2) + ("---",))]
+        lines += map(_markdown_line, cells)
         lines.append("")
         for figure in drawn:
             lines += [f"![{figure.title}]({figure.file.relative_to(comparison.folder)})", ""]
@@ -221,8 +230,9 @@ def _html(comparison: Comparison, rows: list[Table], figures: dict[str, list[Fig
         f"<h1>{title}</h1><p>{escape(_EXPLANATION)}</p>",
     ]
     for name, drawn in figures.items():
-        parts += [f"<h2>{escape(name)}</h2><table>", _html_line("th", _COLUMNS)]
-        parts += [_html_line("td", _cells(row)) for row in rows if row["data"] == name]
+        titles, *cells = _table_of(rows, name)
+        parts += [f"<h2>{escape(name)}</h2><table>", _html_line("th", titles)]
+        parts += [_html_line("td", row) for row in cells]
         parts.append("</table>")
         for figure in drawn:
             data = base64.b64encode(figure.file.read_bytes()).decode("ascii")
