@@ -18,8 +18,6 @@ __all__ = ["ConfigError", "DataError", "EstimationError", "SlamGraphError", "clo
 
 _LONGEST = 1500
 """Characters of a message that are shown."""
-_UNSEEN = ("Cc", "Cf", "Cs", "Co", "Cn", "Zl", "Zp")
-"""Categories of characters that are shown by their code: they control, or have no form."""
 
 
 class SlamGraphError(Exception):
@@ -31,7 +29,8 @@ class SlamGraphError(Exception):
         # it may quote a file from anywhere: no other lines, and nothing that steers a terminal
         line = " ".join(super().__str__().splitlines())
         if not line.isprintable():
-            line = "".join(ascii(c)[1:-1] if category(c) in _UNSEEN else c for c in line)
+            shown = (c.isprintable() or category(c) == "Zs" for c in line)
+            line = "".join(c if s else ascii(c)[1:-1] for c, s in zip(line, shown, strict=True))
         return line if len(line) <= _LONGEST else f"{line[:_LONGEST]} …"
 
 

@@ -19,7 +19,6 @@ from hypothesis import strategies as st
 from hypothesis.internal.conjecture import providers
 
 from slam_graph.errors import SlamGraphError
-from slam_graph.files import Files
 from slam_graph.geometry import Trajectory
 
 _Read = TypeVar("_Read")
@@ -31,7 +30,7 @@ if not CAMPAIGN:
     providers._get_local_constants = providers.Constants
 
 
-LARGEST_STAMP_NS = Files.LARGEST_STAMP_NS
+LARGEST_STAMP_NS = 2**62
 """What readers take for a time is nearer to zero."""
 
 
@@ -78,8 +77,8 @@ def vectors(count: int, largest: float = 1e17) -> st.SearchStrategy[list[float]]
 def stamps(
     fewest: int = 0,
     most: int = 5,
-    least: int = 1 - Files.LARGEST_STAMP_NS,
-    end: int = Files.LARGEST_STAMP_NS,
+    least: int = 1 - LARGEST_STAMP_NS,
+    end: int = LARGEST_STAMP_NS,
 ) -> st.SearchStrategy[np.ndarray]:
     """(N,) increasing times, from `least` to before `end`."""
     inside = st.integers(least, end - 1)

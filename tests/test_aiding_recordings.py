@@ -17,9 +17,7 @@ from scipy.spatial.transform import Rotation
 from slam_graph.arrays import FloatArray
 from slam_graph.datasets import open_dataset
 from slam_graph.datasets.sequence import RecordedSequence
-from slam_graph.datasets.streams.aiding_files import read_fixes
 from slam_graph.datasets.streams.geodesy import geodetic_positions
-from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import DataError
 
 COUNT = 6
@@ -390,20 +388,3 @@ def test_kitti_without_any_accuracy_has_no_fixes(tmp_path: Path) -> None:
     sequence = open_dataset(drive, sources={"gnss": "oxts"})
     assert len(sequence.aiding) == 0
     assert counts(sequence) == {"gnss_dropped": 72}
-
-
-# --- files ----------------------------------------------------------------------------------------
-
-
-def test_one_time_from_the_future_does_not_block_a_file(tmp_path: Path) -> None:
-    rows = [[k, k, 0, 0, 1, 1, 1] for k in range(1, 7)]
-    rows[2][0] = 10**15
-    rows[4][1] = "nan"  # type: ignore[call-overload]
-    path = tmp_path / "gnss.csv"
-    header = "#timestamp [ns],east [m],north [m],up [m],e,n,u\n"
-    path.write_text(header + "".join(",".join(map(str, row)) + "\n" for row in rows))
-    counted = Diagnostics()
-    assert read_fixes(path, counted).fix_stamps_ns.tolist() == [1, 2, 4, 6]
-    assert counted.counts == {"gnss_dropped": 2}
-    path.write_text(header + "1,nan,0,0,1,1,1\n")
-    assert len(read_fixes(path, counted)) == 0

@@ -4,13 +4,11 @@
 
 from collections.abc import Callable
 
-import cv2
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from slam_graph.kernels.ascending import are_among, are_among_numpy
-from slam_graph.kernels.corners import strongest_maxima, strongest_maxima_numpy
 from slam_graph.kernels.elimination import (
     eliminate_columns,
     eliminate_columns_numpy,
@@ -43,8 +41,6 @@ from slam_graph.kernels.gate import (
     track_distances,
     track_distances_numpy,
 )
-from slam_graph.kernels.halvings import halved, halvings_room
-from slam_graph.kernels.near_pairs import near_pairs, near_pairs_numpy
 from slam_graph.kernels.null_space import triangularize_features, triangularize_features_numpy
 from slam_graph.kernels.patch_search import most_similar, most_similar_numpy
 from slam_graph.kernels.projection import (
@@ -55,18 +51,8 @@ from slam_graph.kernels.projection import (
     to_cameras_numpy,
 )
 from slam_graph.kernels.ray_triangulation import triangulate_rays, triangulate_rays_numpy
-from slam_graph.kernels.spacing import (
-    apart,
-    apart_numpy,
-    claim,
-    claim_numpy,
-    clear_disks,
-    clear_disks_numpy,
-)
 from slam_graph.kernels.state_rows import fill_state_rows, fill_state_rows_numpy
 from slam_graph.kernels.track_motion import motion_steps, motion_steps_numpy
-from slam_graph.kernels.window_tracking import WINDOW_PX, track_windows
-from slam_graph.kernels.window_tracking_numpy import track_windows_numpy
 from slam_graph.sensors import Camera
 from slam_graph.sensors.camera_model import CameraModel
 from slam_graph.sensors.lens_models import RadialTangential
@@ -301,46 +287,6 @@ def test_are_among(count: int) -> None:
     assert found.any() == (count > 0)
 
 
-def disk(radius: int) -> np.ndarray:
-    image = np.zeros((2 * radius + 1, 2 * radius + 1), np.uint8)
-    cv2.circle(image, (radius, radius), radius, 1, cv2.FILLED)
-    return image.sum(axis=1, dtype=np.int64) // 2
-
-
-@pytest.mark.parametrize("radius", [0, 1, 4, 12, 30])
-def test_clear_disks(radius: int) -> None:
-    rng = np.random.default_rng(1)
-    points = rng.uniform(-20.0, 140.0, (40, 2)).astype(np.float32)
-    masks = [np.full((100, 120), 255, np.uint8) for _ in range(3)]
-    clear_disks(masks[0], points, disk(radius))
-    clear_disks_numpy(masks[1], points, disk(radius))
-    for u, v in np.rint(points).astype(int).tolist():
-        cv2.circle(masks[2], (u, v), radius, 0, cv2.FILLED)
-    assert np.array_equal(masks[0], masks[1])
-    assert np.array_equal(masks[0], masks[2])
-
-
-@pytest.mark.parametrize("count", [0, 5, 1000])
-def test_claim(count: int) -> None:
-    rng = np.random.default_rng(2)
-    points = rng.uniform(0.0, 119.0, (300, 2)).astype(np.float32)
-    mask = np.where(rng.random((100, 120)) < 0.7, np.uint8(255), np.uint8(0))
-    masks = mask.copy(), mask.copy()
-    chosen = claim(masks[0], points, count, 8.5, disk(8))
-    assert np.array_equal(chosen, claim_numpy(masks[1], points, count, 8.5, disk(8)))
-    assert np.array_equal(*masks)
-    assert len(chosen) == 0 if count == 0 else 0 < len(chosen) <= count
-    apart_px = np.linalg.norm(points[chosen][:, None] - points[chosen], axis=2)
-    assert np.all(apart_px[~np.eye(len(chosen), dtype=bool)] >= 8.5)
-
-
-def test_apart() -> None:
-    points = np.random.default_rng(3).uniform(0.0, 60.0, (200, 2)).astype(np.float32)
-    alone = apart(points, 3.0)
-    assert np.array_equal(alone, apart_numpy(points, 3.0))
-    assert 0 < np.count_nonzero(alone) < len(points)
-
-
 def test_epipolar_constraint() -> None:
     rng = np.random.default_rng(4)
     F, a, b = rng.normal(size=(3, 3)), rng.normal(size=(90, 2)), rng.normal(size=(90, 2))
@@ -427,16 +373,6 @@ def test_eliminate_features() -> None:
     assert all(same(own, other) for own, other in zip(*results, strict=True))
 
 
-@pytest.mark.parametrize("count", [0, 40])
-def test_near_pairs(count: int) -> None:
-    rng = np.random.default_rng(8)
-    one, other = rng.uniform(0.0, 100.0, (count, 2)), rng.uniform(0.0, 100.0, (300, 2))
-    found = near_pairs(one, other, 8.0)
-    assert np.array_equal(found, near_pairs_numpy(one, other, 8.0))
-    assert found.shape[1] == 2
-    assert len(found) > count or count == 0
-
-
 def test_a_division_by_zero_is_no_exception() -> None:
     """A feature that no observation depends on: its linear system is refused later, as NaN."""
     r, by_pose, none = np.ones((2, 2)), np.ones((2, 2, 6)), np.zeros((2, 2, 0))
@@ -444,89 +380,3 @@ def test_a_division_by_zero_is_no_exception() -> None:
     R_f, T, products = np.zeros((1, 3, 3)), np.zeros((1, 3, 13)), np.zeros((13, 13))
     sum_of_features(r, by_pose, np.zeros((2, 2, 3)), none, frame, starts, R_f, T, products)
     assert np.isnan(T).any()
-
-
-def two_images() -> tuple[np.ndarray, np.ndarray]:
-    noise = np.random.default_rng(7).integers(0, 256, (120, 150)).astype(np.uint8)
-    image = cv2.GaussianBlur(noise, (0, 0), 2.0)
-    image[70:, 100:] = 90  # no texture
-    image[:20, :20] = np.where(np.arange(20) % 4 < 2, 0, 255)  # the largest sums
-    shift = np.array([[1.0, 0.02, 2.6], [-0.02, 1.0, -1.7]])
-    return image, cv2.warpAffine(image, shift, (150, 120), borderMode=cv2.BORDER_REFLECT)
-
-
-def with_halvings(image: np.ndarray, levels: int) -> tuple[np.ndarray, np.ndarray]:
-    halvings = np.empty(halvings_room(image.shape, levels), np.uint8)
-    for level in range(levels):
-        halved(image, halvings, level + 1)[:] = cv2.pyrDown(halved(image, halvings, level))
-    return image, halvings
-
-
-@pytest.mark.parametrize("levels", [0, 1, 2])
-def test_track_windows(levels: int) -> None:
-    rng = np.random.default_rng(8)
-    image, other = two_images()
-    points = rng.uniform(-9.0, 160.0, (150, 2)).astype(np.float32)  # some outside
-    start = points + rng.normal(0.0, 2.0, points.shape).astype(np.float32)
-    images = *with_halvings(image, levels), *with_halvings(other, levels)
-    results = [
-        form(*images, points, start, levels, 5, 15, 0.02, 1e-3)
-        for form in (track_windows, track_windows_numpy)
-    ]
-    for ours, theirs in zip(*results, strict=True):
-        np.testing.assert_array_equal(ours, theirs)
-    assert 20 < np.count_nonzero(results[0][1]) < 140
-
-
-def test_track_windows_is_opencv() -> None:
-    rng = np.random.default_rng(9)
-    image, other = two_images()
-    points = rng.uniform(3.0, 147.0, (400, 2)).astype(np.float32)
-    start = points + rng.normal(0.0, 1.5, points.shape).astype(np.float32)
-    settings = {
-        "winSize": (WINDOW_PX, WINDOW_PX),
-        "maxLevel": 1,
-        "criteria": (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 15, 0.02),
-        "flags": cv2.OPTFLOW_USE_INITIAL_FLOW,
-        "minEigThreshold": 1e-3,
-    }
-    theirs, status, _ = cv2.calcOpticalFlowPyrLK(image, other, points, start.copy(), **settings)
-    images = *with_halvings(image, 1), *with_halvings(other, 1)
-    back, returned, _ = cv2.calcOpticalFlowPyrLK(
-        other, image, theirs, points.copy(), status=None, err=None, **(settings | {"maxLevel": 0})
-    )
-    ours, found, round_px = track_windows(*images, points, start, 1, -1000, 15, 0.02, 1e-3)
-    both = (status[:, 0] == 1) & (returned[:, 0] == 1)
-    np.testing.assert_array_equal(found, both)
-    # OpenCV's sums are rounded; a point at the limit of the last step may take one more
-    for one, two in (
-        (ours, theirs),
-        (round_px[:, None], np.linalg.norm(back - points, axis=1)[:, None]),
-    ):
-        error_px = np.abs(one - two).max(axis=1)[found]
-        assert np.median(error_px) < 1e-4
-        assert error_px.max() < 0.1
-
-
-@pytest.mark.parametrize("count", [0, 1, 5, 100])
-@pytest.mark.parametrize("distance_px", [1.0, 8.0])
-@pytest.mark.parametrize("levels", [3, 200])
-def test_strongest_maxima_are_those_of_opencv(count: int, distance_px: float, levels: int) -> None:
-    rng = np.random.default_rng(7)
-    image = cv2.GaussianBlur(rng.integers(0, levels, (60, 73), np.uint8), (0, 0), 1.5)
-    image[20:50, 30:60] = 0  # without gradients all scores are alike
-    image[35:40, 40:45] = levels
-    allowed = np.full(image.shape, 255, np.uint8)
-    allowed[:30, 10:20] = 0
-    scores = np.asarray(cv2.cornerMinEigenVal(image, 7), np.float32)
-    smallest = 0.3 * float(scores.max())
-    given = scores, allowed, count, 0.05, smallest, distance_px
-    found = strongest_maxima(*given)
-    np.testing.assert_array_equal(found, strongest_maxima_numpy(*given))
-    if count:  # to OpenCV, 0 means all
-        corners, strengths = cv2.goodFeaturesToTrackWithQuality(
-            image, count, 0.05, distance_px, allowed, blockSize=7
-        )
-        opencv = np.column_stack([np.reshape(corners, (-1, 2)), np.ravel(strengths)])
-        np.testing.assert_array_equal(found, opencv[opencv[:, 2] >= smallest])
-    assert len(strongest_maxima(scores, np.zeros_like(allowed), 9, 0.05, 0.0, 1.0)) == 0

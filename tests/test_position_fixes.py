@@ -385,3 +385,16 @@ def test_the_final_adjustment_is_in_the_world_of_the_fixes() -> None:
     causal = ape(sequence.groundtruth(), result.trajectory, alignment="none").statistics.rmse
     assert smoothed < 0.75 * causal
     assert smoothed < 0.8
+
+
+def test_one_time_from_the_future_does_not_block_a_file(tmp_path: Path) -> None:
+    rows = [[k, k, 0, 0, 1, 1, 1] for k in range(1, 7)]
+    rows[2][0], rows[4][1] = 10**15, "nan"  # type: ignore[call-overload]
+    path = tmp_path / "gnss.csv"
+    header = "#timestamp [ns],east [m],north [m],up [m],e,n,u\n"
+    path.write_text(header + "".join(",".join(map(str, row)) + "\n" for row in rows))
+    counted = Diagnostics()
+    assert read_fixes(path, counted).fix_stamps_ns.tolist() == [1, 2, 4, 6]
+    assert counted.counts == {"gnss_dropped": 2}
+    path.write_text(header + "1,nan,0,0,1,1,1\n")
+    assert len(read_fixes(path, counted)) == 0

@@ -120,7 +120,10 @@ class EstimatorKnowledge:
 
     @property
     def predicted(self) -> gtsam.Pose3 | None:
-        """The last frame's pose by the IMU alone, from the estimate before; None if unknown."""
+        """`world_T_body` of the last frame as the IMU predicts it from the estimate before.
+
+        None where samples were missing, without an IMU, and without a covariance.
+        """
         return self._context.propagation.predicted
 
     @property

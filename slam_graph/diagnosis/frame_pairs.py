@@ -110,6 +110,5 @@ def _pair(
 
 def _by_lens(seen: FeatureObservations, lens: Camera) -> FeatureObservations:
     """The observations under a lens, without those beyond its edge."""
-    with np.errstate(all="ignore"):
-        normalized, known = lens.visible(seen.pixels)
+    normalized, known = lens.visible(seen.pixels)
     return replace(seen, normalized=normalized).select(known)

@@ -33,7 +33,10 @@ class Kinematics:
     scale: float = 1.0
 
     def moved(self, by: FloatArray) -> Kinematics:
-        """With a change (10,) in the order of `WITH_SCALE`; mountings turn in the camera frame."""
+        """With a change (10,) in the order of `rotation_fit.WITH_SCALE`.
+
+        Mountings turn in the camera frame.
+        """
         return Kinematics(
             self.offset_s + float(by[0]),
             self.focal * float(np.exp(by[1])),

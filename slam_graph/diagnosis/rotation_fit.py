@@ -37,8 +37,6 @@ _STEP = np.array([1e-4, 1e-4, 1e-4, 1e-5, 1e-5, 1e-5, 1e-5, 1e-5, 1e-5, 1e-4])
 """Steps of the numerical derivatives."""
 _LARGEST = np.array([0.03, 0.1, 0.02, 0.1, 0.1, 0.1, 0.05, 0.05, 0.05, 0.1])
 """Largest change of an unknown in one step."""
-_JUMP = 0.6
-"""No epipolar distance changes so much by the largest change of an unknown, in focal lengths."""
 _CAUCHY = 2.4
 """Residual with half the weight, in units of the noise."""
 _SIGMA_OF_MEDIAN = 1.4826
@@ -160,8 +158,7 @@ class RotationProblem:
             camera = self._mounted.camera
             scaled = replace(camera, fx=camera.fx * focal, fy=camera.fy * focal)
             moved = self._pixels[None] + _PIXEL_STEPS[:, None, None, None]
-            with np.errstate(all="ignore"):  # beyond the edge of a wide lens
-                points, visible = scaled.visible(moved.reshape(-1, 2))
+            points, visible = scaled.visible(moved.reshape(-1, 2))
             m = points.reshape(moved.shape)
             rays = np.concatenate([m, np.ones((*m.shape[:-1], 1))], axis=-1)
             rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
@@ -239,7 +236,7 @@ class RotationProblem:
         return 0.5 * _CAUCHY**2 * float(np.sum(squares))
 
     def _distances_of_all(self, at: Kinematics, t: FloatArray, beyond_px: float) -> FloatArray:
-        """Epipolar distances of all features, in one row; this one for those without a bearing.
+        """Epipolar distances (M,) of all features, pixels; `beyond_px` for those without a bearing.
 
         They must not count as if they fitted: a focal length that puts them beyond the edge of a
         wide lens would look better for each of them.
@@ -304,11 +301,7 @@ class RotationProblem:
             moved = at.moved(change)
             J[..., c] = (self.distances(moved, t) - e) / _STEP[k]
             known = known & self.bearings(moved.focal)[2]
-        # beyond the edge of a wide lens there is no bearing, so that a distance jumps in a step
-        most = _JUMP * self._mounted.camera.fx / _LARGEST[columns]
-        steady = np.all(np.abs(J) < most, axis=-1, keepdims=True)
-        J = np.where(steady, J, 0.0)
-        root = np.sqrt((known & steady[..., 0]) / (1.0 + (e / (_CAUCHY * noise)) ** 2)) / noise
+        root = np.sqrt(known / (1.0 + (e / (_CAUCHY * noise)) ** 2)) / noise
         e, J, by_t = e * root, J * root[..., None], by_t * root[..., None]
         inner = by_t.transpose(0, 2, 1) @ by_t + 1e-9 * np.eye(2)
         gradients = np.einsum("pni,pn->pi", J, e)  # the directions are at their best: none by them

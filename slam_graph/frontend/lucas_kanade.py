@@ -57,7 +57,7 @@ class Flow:
         points: (N, 2) float32 pixels in the other image.
         found: (N,) whether Lucas-Kanade converged inside the image, forward and back.
         error_px: (N,) distance between a point and itself after tracking it forward and back;
-            of no meaning where it was not found.
+            infinite where it was not found.
     """
 
     points: Pixels
@@ -118,7 +118,8 @@ class LucasKanade:
             target: image of the same size.
             points: (N, 2) float32 pixels in `source`.
             guess: (N, 2) where to start in `target`.
-            levels: of the pyramid, besides the image itself.
+            levels: of the pyramid, besides the image itself; at most the larger one of
+                `pyramid_levels` and 1.
         """
         if len(points) == 0:
             return Flow(points, np.zeros(0, np.bool_), np.zeros(0, np.float32))
@@ -129,12 +130,9 @@ class LucasKanade:
         one, other = self._pyramid(source, levels), self._pyramid(target, levels)
         points = np.ascontiguousarray(points, np.float32)
         start = np.ascontiguousarray(guess, np.float32)
-        return Flow(
-            *track_windows(
-                *(one.image, one.halvings, other.image, other.halvings, points, start, levels),
-                *(BORDER_PX, _ITERATIONS, _STEP_PX, _MIN_EIGENVALUE),
-            )
-        )
+        images = one.image, one.halvings, other.image, other.halvings
+        limits = BORDER_PX, _ITERATIONS, _STEP_PX, _MIN_EIGENVALUE
+        return Flow(*track_windows(*images, points, start, levels, *limits))
 
     def _pyramid(self, image: Image, levels: int) -> _Pyramid:
         """The pyramid of an image, with at least so many levels."""
@@ -152,8 +150,9 @@ class LucasKanade:
         forward, found = self._by_opencv(source, target, points, guess, levels)
         found &= inside(forward, target.shape, BORDER_PX)
         back, returned = self._by_opencv(target, source, forward, points, _BACKWARD_LEVELS)
-        error_px = np.linalg.norm(back - points, axis=1)
-        return Flow(forward, found & returned, error_px)
+        found &= returned
+        error_px = np.where(found, np.linalg.norm(back - points, axis=1), np.float32(np.inf))
+        return Flow(forward, found, error_px)
 
     def _by_opencv(
         self, source: Image, target: Image, points: Pixels, start: Pixels, levels: int

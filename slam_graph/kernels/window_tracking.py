@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""Pyramidal Lucas-Kanade, forth and back (Bouguet 2000, Kalal et al. 2010).
+"""Pyramidal Lucas-Kanade with a forward-backward check (Bouguet 2000, Kalal et al. 2010).
 
 OpenCV's `calcOpticalFlowPyrLK` builds the pyramids and derivatives of both images in every call.
 Here pyramids are given, and derivatives are taken where they are needed. Positions, weights of 14
@@ -289,8 +289,8 @@ def track_windows(
 
     Returns:
         points: (N, 2) pixels in `target`.
-        found: (N,) whether there are such, forth and back.
-        error_px: (N,) distance of a point to itself after both ways; infinite if it was not found.
+        found: (N,) whether they were tracked, forward and backward.
+        error_px: (N,) forward-backward error; infinite where a point was not found.
     """
     n = len(points)
     moved, found = np.empty((n, 2), np.float32), np.ones(n, np.bool_)

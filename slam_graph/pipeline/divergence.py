@@ -20,9 +20,9 @@ from slam_graph.geometry import NavState
 from slam_graph.sensors import FeatureFrame
 
 _KNOWN_VELOCITY, _LESS_KNOWN = 0.5, 3.0
-"""Standard deviation of a velocity, m/s, and by how much it may exceed that before samples of the
-IMU were missing, once there are samples again. Where features have known depths it is below 0.05
-soon, and 2 to 10 where they have none."""
+"""Standard deviation of a velocity, m/s, and the factor by which it may exceed the one before
+samples of the IMU were missing, once there are samples again. Where features have known depths it
+is below 0.05 soon, and 2 to 10 where they have none."""
 _SAMPLED_FRAMES = 4
 """It is unknown if none of so many frames with samples knows it. GTSAM's smoothers take what a
 frame sees with the next one."""
@@ -240,10 +240,10 @@ class Corrections:
 
 
 class Bridging:
-    """The velocity after a time without samples of the IMU, through which images alone have led.
+    """Whether the velocity is known again after an IMU dropout that images alone had to bridge.
 
-    A camera whose features have no known depth, as at a take-off, does not tell it. An estimator
-    takes steps from a velocity that may be anything, each of which makes it surer.
+    A camera whose features have no known depth, as at a take-off, does not constrain it. The
+    estimator then becomes more certain with every step of a velocity that is arbitrary.
     """
 
     def __init__(self) -> None:

@@ -39,10 +39,10 @@ _FIRST_LOOK_NS = 5_000_000_000
 """A run that has waited so long for a start is looked at, and again after twice that."""
 _HINDERING = {"gyroscope_scale": 0.1, "baseline": 0.3}
 """Logarithms of factors from which these keep a run from starting; smaller ones only harm it."""
-_RUINING = {"focal_length": 0.2, "gyroscope_scale": 0.1, "baseline": 0.3}
+_RUINING = _HINDERING | {"focal_length": 0.2}
 """Those from which an estimate that goes on is worth nothing."""
 _RUINING_DEG = 6.0
-"""The same for a turn of the cameras."""
+"""Least error of the mounting, in degrees, that does the same."""
 _FAILED = ("not_initialized", "diverged", "low_coverage")
 _DOUBTS = ("start_corrected", "new_segment", "scale_unknown")
 """Warnings after which an estimate that came to its end is doubted."""
@@ -62,7 +62,7 @@ _Matters = Callable[[str, Mapping[str, object]], bool]
 def _hinders(
     kind: str, values: Mapping[str, object], least: Mapping[str, float] = _HINDERING
 ) -> bool:
-    """Whether the factor of a fault, if it has one, is so large; by default, that none starts."""
+    """Whether the factor of a fault reaches the limit for its kind; true of faults without one."""
     factor = values.get("factor")
     return not isinstance(factor, float) or abs(math.log(factor)) >= least.get(kind, 0.0)
 

@@ -307,7 +307,7 @@ def _numbers(cells: Iterable[str]) -> FloatArray:
         ValueError: if a cell is none.
     """
     values = np.array([float(cell or "nan") for cell in cells], np.float64)
-    values[np.abs(values) > Files.LARGEST] = np.nan
+    values[~Files.are_measurable(values)] = np.nan
     return values
 
 

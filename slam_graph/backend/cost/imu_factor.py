@@ -149,7 +149,10 @@ class Propagation:
 
     @property
     def predicted(self) -> gtsam.Pose3 | None:
-        """The last frame's pose by the IMU alone, from the estimate before; None if unknown."""
+        """`world_T_body` of the last frame as the IMU predicts it from the estimate before.
+
+        None where samples were missing, without an IMU, and without a covariance.
+        """
         if self._predicted is None or self.guesses or self.missed:
             return None
         return self._predicted.world_T_body

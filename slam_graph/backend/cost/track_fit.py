@@ -81,8 +81,9 @@ class _Pose:
     Attributes:
         stamp_ns: time of the frame.
         index: of the frame.
-        reported: rotation (3, 3) and position (3,).
-        carried: the same without the corrections since the first frame.
+        reported: rotation (3, 3) and position (3,) of `world_T_body`.
+        carried: the same by chained predictions of the IMU, without the estimator's corrections, in
+            the frame of the first body.
         motion: of the body within the frame.
     """
 
@@ -132,8 +133,8 @@ class TrackFit:
             sigma_px: standard deviation of the observations.
             moving: ids (N,) of features that move by themselves, ascending.
             motion: of the body within the frame, for rolling shutters.
-            predicted: the pose by the IMU alone, from the one that was reported for the frame
-                before; None where that is not known.
+            predicted: `world_T_body` of this frame, predicted by the IMU from the pose reported for
+                the frame before; None where that is not known.
 
         Returns:
             How the tracks compare; None if it is too early for the next comparison.

@@ -93,6 +93,7 @@ class FaultySequence(RecordedSequence):
                     f"has {(end[0] - info.start_ns) * 1e-9:.1f} s; choose an earlier time"
                 )
             end = fault.stamped(end, self._around)
+        self._end_ns = int(end[0])
 
     @property
     def has_groundtruth(self) -> bool:
@@ -101,11 +102,7 @@ class FaultySequence(RecordedSequence):
 
     def measure(self) -> SequenceInfo:
         """What the recording holds without its faults, and when it ends with them."""
-        info = self.recording.info()
-        end = np.array([info.end_ns], np.int64)
-        for fault in self.faults:
-            end = fault.stamped(end, self._around)
-        return replace(info, end_ns=int(end[0]))
+        return replace(self.recording.info(), end_ns=self._end_ns)
 
     def frames(self, start_ns: int | None = None, end_ns: int | None = None) -> FrameStream:
         """The frames with their faults; those whose stamps do not increase are left out."""

@@ -327,7 +327,7 @@ class TrackRecordingSequence(RecordedSequence):
                 f"{self.path / FRAMES}: the numbers of features do not add up to the {features} of "
                 f"{META}; {AGAIN}"
             )
-        if np.any(stamps[1:] <= stamps[:-1]) or np.any(np.abs(stamps) >= Files.LARGEST_STAMP_NS):
+        if np.any(stamps[1:] <= stamps[:-1]) or not Files.are_times(stamps).all():
             raise DataError(f"{self.path / FRAMES}: the times do not increase; {AGAIN}")
 
     def _check_descriptors(self) -> None:
