@@ -111,16 +111,21 @@ class _Turned:
         spread = skew(-self.two) @ self.by_one, skew(self.one) @ self.by_two
         return np.asarray(sum(part @ part.swapaxes(-1, -2) for part in spread))
 
+    @cached_property
+    def _largest(self) -> FloatArray:
+        """(P, N) squared derivatives of the bearings, summed."""
+        parts = (self.by_one, self.by_two)
+        return np.asarray(sum(np.einsum("pnij,pnij->pn", part, part) for part in parts))
+
     def distances(self, t: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Epipolar distances (P, N), pixels, and the deviations of t · n that they are units of."""
-        along = t[:, None]
+        along = skew(t)
         by_pixels = (
-            np.cross(self.two, along)[..., None, :] @ self.by_one,
-            np.cross(along, self.one)[..., None, :] @ self.by_two,
+            np.einsum("pni,pnij->pnj", self.two @ along, self.by_one),
+            np.einsum("pni,pnij->pnj", self.one @ along, self.by_two),
         )
-        variance = np.sum(by_pixels[0] ** 2 + by_pixels[1] ** 2, axis=(2, 3))
-        largest = np.sum(self.by_one**2 + self.by_two**2, axis=(2, 3))
-        sigma = np.sqrt(np.maximum(variance, _LEAST_VARIANCE * largest + 1e-12))
+        variance = sum(np.einsum("pnj,pnj->pn", part, part) for part in by_pixels)
+        sigma = np.sqrt(np.maximum(variance, _LEAST_VARIANCE * self._largest + 1e-12))
         return np.einsum("pni,pi->pn", self.normals, t) / sigma, sigma
 
 
@@ -325,9 +330,11 @@ def _least(moments: FloatArray) -> FloatArray:
 
 def _scales(sizes: FloatArray, there: BoolArray) -> FloatArray:
     """Robust standard deviations (P,) of residuals (P, N); zero where there are none."""
-    present = np.where(there, sizes, np.nan)
-    present[~there.any(axis=1)] = 0.0
-    return np.asarray(_SIGMA_OF_MEDIAN * np.nanmedian(present, axis=1))
+    ordered = np.sort(np.where(there, sizes, np.inf), axis=1)
+    count = np.sum(there, axis=1)
+    middle = np.stack([np.maximum(count - 1, 0) // 2, count // 2], axis=1)
+    median = np.take_along_axis(ordered, np.minimum(middle, sizes.shape[1] - 1), axis=1)
+    return np.where(count > 0, _SIGMA_OF_MEDIAN * np.mean(median, axis=1), 0.0)
 
 
 def _covariance(information: FloatArray, scores: FloatArray, prior: FloatArray) -> FloatArray:
