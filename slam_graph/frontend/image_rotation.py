@@ -31,10 +31,13 @@ _BLUR = 1.0
 """Standard deviation, in small pixels, of the blur that makes alignment smooth."""
 _FITTING = 0.2
 """Images fit if they differ by less than this part of their contrast, squared."""
+_DAMPING = 1e-6 * np.eye(3)
+"""Of the normal equations, grey values squared: images without contrast do not turn."""
 _LEAST_OVERLAP = 0.4
 """Part of the image that both must show."""
 
-_Small = NDArray[np.float32]
+SmallImage = NDArray[np.float32]
+"""As images are aligned: `ImageRotation.reduced`."""
 
 
 class ImageRotation:
@@ -55,17 +58,17 @@ class ImageRotation:
         v, u = np.mgrid[:height, :_WIDTH]
         x, y = (u - self._K[0, 2]) / self._K[0, 0], (v - self._K[1, 2]) / self._K[1, 1]
         # how a pixel moves with a turn of the camera's points, by its components
-        along_u = np.stack([-x * y, 1 + x * x, -y], axis=-1) * self._K[0, 0]
-        along_v = np.stack([-(1 + y * y), x * y, x], axis=-1) * self._K[1, 1]
+        along_u = np.stack([-x * y, 1 + x * x, -y]) * self._K[0, 0]
+        along_v = np.stack([-(1 + y * y), x * y, x]) * self._K[1, 1]
         self._along = along_u, along_v
         self._window = cv2.createHanningWindow(self._size, cv2.CV_32F)
-        self._last: tuple[Image, _Small] | None = None
+        self._last: tuple[Image, SmallImage] | None = None
         self._turn = np.eye(3)
 
     def between(self, before: Image, after: Image) -> FloatArray:
         """after_R_before (3, 3) of the camera."""
-        one = self._small(before)
-        other = self._small(after)
+        one = self.reduced(before)
+        other = self.reduced(after)
         self._last = after, other
         guesses = [np.eye(3), self._turn, self._by_shift(one, other)]
         costs = [self._cost(one, other, R) for R in guesses]
@@ -79,14 +82,14 @@ class ImageRotation:
         self._turn = min(found, key=itemgetter(0))[1]
         return self._turn
 
-    def aligned(self, before: Image, after: Image, guess: FloatArray) -> FloatArray:
-        """after_R_before (3, 3) of images that need not follow one another, near a guess."""
-        one, other = self._small(before), self._small(after)
+    def aligned(self, one: SmallImage, after: Image, guess: FloatArray) -> FloatArray:
+        """after_R_before (3, 3) from an earlier reduced image, near a guess."""
+        other = self.reduced(after)
         found = self._refined(one, other, guess)
         better = self._cost(one, other, found) < self._cost(one, other, guess)
         return found if better else guess
 
-    def _small(self, image: Image) -> _Small:
+    def reduced(self, image: Image) -> SmallImage:
         """A small, smooth copy with the mean of its surroundings taken away."""
         if self._last is not None and self._last[0] is image:
             return self._last[1]
@@ -94,13 +97,13 @@ class ImageRotation:
         small = cv2.GaussianBlur(reduced.astype(np.float32), (0, 0), _BLUR)
         return np.asarray(small - cv2.blur(small, (31, 31)), np.float32)
 
-    def _by_shift(self, one: _Small, other: _Small) -> FloatArray:
+    def _by_shift(self, one: SmallImage, other: SmallImage) -> FloatArray:
         """The rotation that shifts the middle of the image as phase correlation says."""
         (u, v), _ = cv2.phaseCorrelate(one, other, self._window)
         turn = Rotation.from_rotvec([-v / self._K[1, 1], u / self._K[0, 0], 0.0])
         return np.asarray(turn.as_matrix())
 
-    def _warped(self, other: _Small, R: FloatArray) -> tuple[_Small, NDArray[np.bool_]]:
+    def _warped(self, other: SmallImage, R: FloatArray) -> tuple[SmallImage, NDArray[np.bool_]]:
         """The second image as the first camera would see it, and where it does."""
         H = self._K @ R @ self._K_inverse
         flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
@@ -109,26 +112,26 @@ class ImageRotation:
         )
         return np.asarray(warped, np.float32), np.isfinite(warped)
 
-    def _cost(self, one: _Small, other: _Small, R: FloatArray) -> float:
+    def _cost(self, one: SmallImage, other: SmallImage, R: FloatArray) -> float:
         """Mean squared difference; infinite with too little overlap."""
         warped, inside = self._warped(other, R)
         if np.count_nonzero(inside) < _LEAST_OVERLAP * inside.size:
             return float("inf")
         return float(np.mean((warped[inside] - one[inside]) ** 2))
 
-    def _refined(self, one: _Small, other: _Small, R: FloatArray) -> FloatArray:
+    def _refined(self, one: SmallImage, other: SmallImage, R: FloatArray) -> FloatArray:
         """The rotation after Gauss-Newton steps."""
         slope_u, slope_v = (
             cv2.Sobel(one, -1, 1, 0, scale=0.125),
             cv2.Sobel(one, -1, 0, 1, scale=0.125),
         )
-        J = slope_u[..., None] * self._along[0] + slope_v[..., None] * self._along[1]
+        J = slope_u * self._along[0] + slope_v * self._along[1]
         for _ in range(_STEPS):
             warped, inside = self._warped(other, R)
-            rows = J[inside]
-            difference = warped[inside] - one[inside]
+            seen = (J * inside).reshape(3, -1)
+            difference = np.where(inside, warped - one, 0.0).ravel()
             # the first image turned by a small angle has the slopes of itself
-            step = np.linalg.lstsq(rows.T @ rows, rows.T @ difference, rcond=None)[0]
+            step = np.linalg.solve(seen @ seen.T + _DAMPING, seen @ difference)
             R = R @ Rotation.from_rotvec(-step).as_matrix()
             if np.linalg.norm(step) < _SMALLEST_STEP:
                 break

@@ -5,7 +5,8 @@
 A fast turn blurs a few images, and corners are lost in them that are in view again right after.
 Lucas-Kanade compares two images and does not mind how many were taken in between, so some past
 images are remembered with their corners. Those that are missing are tracked from there to the new
-image, from where the rotation between the two puts them.
+image, from where the rotation between the two puts them. One that is not found again in a few
+images that can be tracked well is hidden, and is left alone until it has been out of view.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ import numpy as np
 from slam_graph.arrays import BoolArray, FloatArray, IntArray
 from slam_graph.frontend.association import inside
 from slam_graph.frontend.extraction import BORDER_PX
-from slam_graph.frontend.image_rotation import ImageRotation
+from slam_graph.frontend.image_rotation import ImageRotation, SmallImage
 from slam_graph.frontend.keypoints import Pixels, Tracks
 from slam_graph.frontend.lucas_kanade import LucasKanade
 from slam_graph.frontend.outliers import MIN_POINTS
@@ -30,6 +31,10 @@ _SHARE = 0.6
 """An image is remembered when fewer than this part of the corners of the last one are left."""
 _LEAST = 10
 """Fewer missing corners that should be in view are not looked for."""
+_TRIES = 3
+"""A corner is looked for in so many good images."""
+_GOOD = 0.75
+"""An image is good if this part of the corners is left that there were after the one before."""
 _FITTING = 0.7
 """Part of the corners that must fit the motion. A wrong one is on its epipolar line by chance once
 in some twenty times; where few fit, those that do are such."""
@@ -40,10 +45,23 @@ Inliers = Callable[[FloatArray, FloatArray], BoolArray]
 
 @dataclass(eq=False)
 class _Remembered:
-    """A past image with its corners, and now_R_then (3, 3) of the camera."""
+    """A past image with its corners.
+
+    Attributes:
+        tracks: image and corners (N,).
+        small: the image as it is aligned.
+        turn: now_R_then (3, 3) of the camera.
+        tries: (N,) in how many good images each was looked for since it came into view.
+    """
 
     tracks: Tracks
+    small: SmallImage
     turn: FloatArray
+    tries: IntArray
+
+    def keep(self, which: BoolArray) -> None:
+        """Keep some of the corners only."""
+        self.tracks, self.tries = self.tracks.select(which), self.tries[which]
 
 
 class LostFeatures:
@@ -68,6 +86,7 @@ class LostFeatures:
         self._camera, self._rotation, self._lucas_kanade = camera, rotation, lucas_kanade
         self._levels, self._largest_px = levels, largest_px
         self._past: list[_Remembered] = []
+        self._count = 0  # of the corners in the last image
 
     def turn(self, end_R_start: FloatArray) -> None:
         """Take the rotation (3, 3) of the camera since the image before."""
@@ -76,18 +95,20 @@ class LostFeatures:
 
     def remember(self, tracks: Tracks) -> None:
         """Keep an image if it shows much that the last one that was kept did not."""
-        if len(tracks) < _LEAST:
+        self._count = len(tracks)
+        if len(tracks) < _LEAST or tracks.image is None:
             return
         if self._past:
             left = len(tracks.common(self._past[-1].tracks)[0])
             if left > _SHARE * len(self._past[-1].tracks):
                 return
-        self._past = [*self._past[1 - _IMAGES :], _Remembered(tracks, np.eye(3))]
+        small, tries = self._rotation.reduced(tracks.image), np.zeros(len(tracks), np.int64)
+        self._past = [*self._past[1 - _IMAGES :], _Remembered(tracks, small, np.eye(3), tries)]
 
     def forget(self, ids: IntArray) -> None:
         """Do not look for these any more."""
         for past in self._past:
-            past.tracks = past.tracks.select(~np.isin(past.tracks.ids, ids))
+            past.keep(~np.isin(past.tracks.ids, ids))
 
     def found(self, after: Tracks, inliers: Inliers) -> tuple[IntArray, Pixels]:
         """Ids (N,), ascending, and pixels (N, 2) of missing corners that are found again.
@@ -97,15 +118,16 @@ class LostFeatures:
             inliers: the test that they have in common with those that were followed.
         """
         nothing = np.zeros(0, np.int64), np.zeros((0, 2), np.float32)
-        if after.image is None:
+        sought = self._sought(after)
+        if not sought or max(map(len, sought)) < _LEAST:
             return nothing
-        seen = [self._in_view(past, after) for past in self._past]
-        if not seen or max(map(len, seen)) < _LEAST:
-            return nothing
-        best = max(range(len(seen)), key=lambda k: (len(seen[k]), k))
-        past, rows = self._past[best], seen[best]
+        best = max(range(len(sought)), key=lambda k: (len(sought[k]), k))
+        past, rows = self._past[best], sought[best]
+        if len(after) >= _GOOD * self._count:
+            self._count_tries(past.tracks.ids[rows])
         assert past.tracks.image is not None
-        past.turn = self._rotation.aligned(past.tracks.image, after.image, past.turn)
+        assert after.image is not None
+        past.turn = self._rotation.aligned(past.small, after.image, past.turn)
         missing = past.tracks.select(rows)
         flow = self._lucas_kanade.flow(
             past.tracks.image,
@@ -126,6 +148,24 @@ class LostFeatures:
             return nothing
         return missing.ids[good[fits]], flow.points[good[fits]]
 
+    def _sought(self, after: Tracks) -> list[IntArray]:
+        """Rows of the corners of each past image to look for: missing, and should be in view."""
+        if after.image is None:
+            return []
+        sought = []
+        for past in self._past:
+            places = self._places(past.turn, past.tracks)
+            visible = inside(places, after.image.shape, BORDER_PX)
+            missing = visible & ~np.isin(past.tracks.ids, after.ids)
+            past.tries[~missing] = 0
+            sought.append(np.flatnonzero(missing & (past.tries < _TRIES)))
+        return sought
+
+    def _count_tries(self, ids: IntArray) -> None:
+        """Note that corners are looked for, whichever image they are taken from."""
+        for past in self._past:
+            past.tries[np.isin(past.tracks.ids, ids)] += 1
+
     def _places(self, turn: FloatArray, tracks: Tracks) -> Pixels:
         """Where the rotation puts corners (N, 2); far outside of the image if behind it."""
         rays = np.column_stack([tracks.normalized, np.ones(len(tracks))]) @ turn.T
@@ -133,10 +173,3 @@ class LostFeatures:
         places = np.full((len(tracks), 2), -1e3)
         places[ahead] = self._camera.distort(rays[ahead, :2] / rays[ahead, 2:])[0]
         return places.astype(np.float32)
-
-    def _in_view(self, past: _Remembered, after: Tracks) -> IntArray:
-        """Rows of the corners of a past image that are missing and should be in the new one."""
-        assert after.image is not None
-        missing = ~np.isin(past.tracks.ids, after.ids)
-        there = inside(self._places(past.turn, past.tracks), after.image.shape, BORDER_PX)
-        return np.flatnonzero(missing & there)

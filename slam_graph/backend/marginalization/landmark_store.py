@@ -29,7 +29,7 @@ from slam_graph.backend.solve.square_root import (
     Conditional,
     Layout,
     SquareRootInformation,
-    triangularize,
+    trapezoidal,
 )
 from slam_graph.backend.solve.state import POINT_DIM, State, dims_of
 
@@ -165,7 +165,7 @@ def _exchanged(
         columns = np.append(layout.indices(part.keys), layout.size)
         rows[top : top + len(part.rows), columns] = part.rows
         top += len(part.rows)
-    triangle = triangularize(rows)
+    triangle = trapezoidal(rows)
     width = Layout(dims_of(gone)).size
     return (
         Conditional(Layout(dims_of(gone)), Layout(dims_of([*found, *given])), triangle[:width]),

@@ -328,15 +328,20 @@ def _transposed_inverse(R: FloatArray) -> FloatArray:
 
 def triangularize(Ab: FloatArray) -> FloatArray:
     """The upper triangular factor of a QR decomposition of (m, n) rows, always (n, n)."""
-    m, n = Ab.shape
-    if m < n:
-        Ab = np.vstack([Ab, np.zeros((n - m, n))])
+    n = Ab.shape[1]
+    triangle = np.zeros((n, n), order="F")
+    rows = trapezoidal(Ab)
+    triangle[: len(rows)] = rows
+    return triangle
+
+
+def trapezoidal(Ab: FloatArray) -> FloatArray:
+    """The upper factor of a QR decomposition of (m, n) rows, (min(m, n), n)."""
     qr, _, _, info = lapack.dgeqrf(np.asfortranarray(Ab))
     if info != 0:
         raise ValueError(f"LAPACK's geqrf rejected argument {-info}")
-    triangle = np.zeros((n, n), order="F")
-    np.copyto(triangle, qr[:n], where=upper_triangle(n))
-    return triangle
+    m, n = Ab.shape
+    return np.where(upper_triangle(n)[:m], qr[:n], 0.0)
 
 
 @lru_cache(maxsize=64)
