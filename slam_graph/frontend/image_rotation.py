@@ -93,7 +93,11 @@ class ImageRotation:
         """A small, smooth copy with the mean of its surroundings taken away."""
         if self._last is not None and self._last[0] is image:
             return self._last[1]
-        reduced = cv2.resize(image, self._size, interpolation=cv2.INTER_AREA)
+        reduced: cv2.typing.MatLike = image
+        while reduced.shape[1] >= 4 * _WIDTH:  # halving is ten times as fast as any other factor
+            half = reduced.shape[1] // 2, reduced.shape[0] // 2
+            reduced = cv2.resize(reduced, half, interpolation=cv2.INTER_AREA)
+        reduced = cv2.resize(reduced, self._size, interpolation=cv2.INTER_AREA)
         small = cv2.GaussianBlur(reduced.astype(np.float32), (0, 0), _BLUR)
         return np.asarray(small - cv2.blur(small, (31, 31)), np.float32)
 

@@ -63,6 +63,11 @@ class _Remembered:
         """Keep some of the corners only."""
         self.tracks, self.tries = self.tracks.select(which), self.tries[which]
 
+    def sought(self, missing: BoolArray) -> IntArray:
+        """Rows of the corners to look for, of those (N,) that should be in view and are missing."""
+        self.tries[~missing] = 0
+        return np.flatnonzero(missing & (self.tries < _TRIES))
+
 
 class LostFeatures:
     """Finds the corners of one camera again.
@@ -133,7 +138,7 @@ class LostFeatures:
             past.tracks.image,
             after.image,
             missing.pixels,
-            self._places(past.turn, missing),
+            self._places(_rays(past.turn, missing)),
             self._levels,
         )
         good = np.flatnonzero(flow.found & (flow.error_px < self._largest_px))
@@ -150,26 +155,29 @@ class LostFeatures:
 
     def _sought(self, after: Tracks) -> list[IntArray]:
         """Rows of the corners of each past image to look for: missing, and should be in view."""
-        if after.image is None:
+        if after.image is None or not self._past:
             return []
-        sought = []
-        for past in self._past:
-            places = self._places(past.turn, past.tracks)
-            visible = inside(places, after.image.shape, BORDER_PX)
-            missing = visible & ~np.isin(past.tracks.ids, after.ids)
-            past.tries[~missing] = 0
-            sought.append(np.flatnonzero(missing & (past.tries < _TRIES)))
-        return sought
+        rays = np.concatenate([_rays(past.turn, past.tracks) for past in self._past])
+        ids = np.concatenate([past.tracks.ids for past in self._past])
+        visible = inside(self._places(rays), after.image.shape, BORDER_PX)
+        missing = visible & ~np.isin(ids, after.ids)
+        ends = np.cumsum([len(past.tracks) for past in self._past])[:-1]
+        parts = zip(self._past, np.split(missing, ends), strict=True)
+        return [past.sought(of_image) for past, of_image in parts]
 
     def _count_tries(self, ids: IntArray) -> None:
         """Note that corners are looked for, whichever image they are taken from."""
         for past in self._past:
             past.tries[np.isin(past.tracks.ids, ids)] += 1
 
-    def _places(self, turn: FloatArray, tracks: Tracks) -> Pixels:
-        """Where the rotation puts corners (N, 2); far outside of the image if behind it."""
-        rays = np.column_stack([tracks.normalized, np.ones(len(tracks))]) @ turn.T
+    def _places(self, rays: FloatArray) -> Pixels:
+        """Where rays (N, 3) of the camera hit the image (N, 2); far outside of it if behind."""
         ahead = rays[:, 2] > 0.2
-        places = np.full((len(tracks), 2), -1e3)
+        places = np.full((len(rays), 2), -1e3)
         places[ahead] = self._camera.distort(rays[ahead, :2] / rays[ahead, 2:])[0]
         return places.astype(np.float32)
+
+
+def _rays(turn: FloatArray, tracks: Tracks) -> FloatArray:
+    """Rays (N, 3) of corners, turned by a rotation (3, 3)."""
+    return np.column_stack([tracks.normalized, np.ones(len(tracks))]) @ turn.T
