@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
-from functools import wraps
+from functools import cache, wraps
 from typing import ParamSpec, TypeVar
 
 from threadpoolctl import ThreadpoolController
@@ -22,7 +22,7 @@ class SingleThread:
     """Holds the BLAS libraries that are loaded to one thread, for a while."""
 
     def __init__(self) -> None:
-        self._blas = ThreadpoolController().select(user_api="blas")
+        self._blas = _blas_libraries()
 
     def held(self) -> AbstractContextManager[object]:
         """For the time of a block; it is quick where there is but one thread anyway."""
@@ -30,6 +30,15 @@ class SingleThread:
             return nullcontext()
         limited: AbstractContextManager[object] = self._blas.limit(limits=1)
         return limited
+
+
+@cache
+def _blas_libraries() -> ThreadpoolController:
+    """Those of NumPy and SciPy; to look for them takes milliseconds, and each object has an engine.
+
+    Both are loaded before anything is solved.
+    """
+    return ThreadpoolController().select(user_api="blas")
 
 
 def on_one_thread(function: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result]:
