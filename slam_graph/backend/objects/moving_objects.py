@@ -6,8 +6,10 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping
+from dataclasses import replace
 
 from slam_graph.backend.backend_config import BackendConfig
+from slam_graph.backend.depth_camera import with_depth_camera, with_depth_observed
 from slam_graph.backend.estimator import Estimator
 from slam_graph.backend.objects.ego_motion import EgoWindow
 from slam_graph.backend.objects.object_directions import DirectionTracker
@@ -57,7 +59,9 @@ class MovingObjects(ObjectHistory):
         self.single_camera = len(rig.cameras) == 1 and rig.depth is None
         first = max([0, *self.numbers, *(seen.number for seen in self.directions)]) + 1
         self._directions = DirectionTracker(rig, backend, config, first)
-        self._tracker = ObjectTracker(rig, policies, backend, config, first)
+        self._rig = rig
+        both = replace(with_depth_camera(rig), depth=None)  # depth is what a second camera sees
+        self._tracker = ObjectTracker(both, policies, backend, config, first)
 
     def take(self, frame: FeatureFrame, state: NavState, estimator: Estimator) -> ObjectFrame:
         """Take a frame, and leave what moves out of the estimate of the platform.
@@ -75,6 +79,7 @@ class MovingObjects(ObjectHistory):
             found = self._directions.add(frame, ego, self._sigma_px)
             self.directions += found.directions
         else:
+            frame = with_depth_observed(frame, self._rig)
             found = self._tracker.add(frame, ego, self._sigma_px, estimator.pixel_noise_px())
         estimator.exclude(found.moving)
         self.note(found.states, self._tracker.objects)
