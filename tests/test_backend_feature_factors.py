@@ -161,3 +161,16 @@ def test_an_outlier_weighs_less() -> None:
     np.testing.assert_allclose(robust.by_pose[0], plain.by_pose[0] * root)
     np.testing.assert_allclose(robust.by_point[0], plain.by_point[0] * root)
     np.testing.assert_array_equal(robust.by_pose[1:], plain.by_pose[1:])
+
+
+@pytest.mark.parametrize("loss", ["huber", "cauchy"])
+def test_without_its_weights_a_loss_changes_nothing(loss: LossName) -> None:
+    rng = np.random.default_rng(6)
+    cameras = rig(1)
+    obs, at = scene(Flight(), cameras, room(50, rng), np.linspace(0.0, 1.0, 4))
+    obs.pixels[:20] += rng.normal(0.0, 20.0, (20, 2))
+    plain = whiten(obs, RigProjection(cameras), at, at, 1.0, RobustLoss("none"))
+    robust = RobustLoss(loss)
+    again = whiten(obs, RigProjection(cameras), at, at, 1.0, robust).unweighted(robust)
+    np.testing.assert_allclose(again.r, plain.r, rtol=1e-9)
+    np.testing.assert_allclose(again.H, plain.H, rtol=1e-9)

@@ -34,6 +34,7 @@ class SquareRootEngine:
             context.config,
             context.diagnostics,
             context.pixels,
+            vague=context.config.dynamics.start_at_images and not context.rig.has_imu,
         )
         self._posterior: SquareRootInformation | None = None
         self._cost: Cost | None = None

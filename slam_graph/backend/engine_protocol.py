@@ -96,6 +96,11 @@ class EngineContext:
     def _motion(self) -> VisualMotion:
         return VisualMotion(self.rig, self.config.dynamics.min_points)
 
+    def note(self, frame: FeatureFrame) -> None:
+        """Note the frame of a start: what it has a depth of tells the motion to the next one."""
+        if self.config.dynamics.start_at_images:
+            self._motion.note(frame)
+
     def by_images(
         self, frame: FeatureFrame, known: Callable[[], tuple[IntArray, FloatArray]]
     ) -> Callable[[NavState, NavState], NavState] | None:

@@ -347,6 +347,7 @@ class Estimator(EstimatorKnowledge):
             window = self._start_up.try_to_start(stamp_ns, frame)
         if window is not None:
             self._standstill.add_dynamic(self._start_up.outliers)
+            self._context.note(frame)
         return window
 
     def _reviewed(self, stamp_ns: int, frame: FeatureFrame, state: NavState) -> NavState:

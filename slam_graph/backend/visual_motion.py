@@ -118,7 +118,8 @@ class VisualMotion:
             return None
         world = points[np.searchsorted(ids, seen.ids[rows])]
         rays = _unrolled(seen.normalized[rows], seen.pixels[rows, 1], mounted, rate)
-        solved = mounted.body_pose(world, rays[:, :2] / rays[:, 2:], ERROR_PX)
+        rays = rays[:, :2] / rays[:, 2:]
+        solved = mounted.body_pose(world, rays, ERROR_PX, tightened=True)
         if solved is None or np.mean(solved[1]) < _LEAST_SHARE:
             return None
         return solved[0]

@@ -7,15 +7,19 @@ from __future__ import annotations
 import cv2
 import gtsam
 import numpy as np
+from cv2.typing import MatLike
 
 from slam_graph.arrays import BoolArray, FloatArray
 
 RANSAC_ITERATIONS = 200
 _CONFIDENCE = 0.999
+_TIGHTENED, _MEDIANS, _FEWEST = 2, 2.1, 6
+"""How often points are chosen again, up to how many medians of their errors (95 % of normal ones),
+and how many must be left."""
 
 
 def camera_pose(
-    points: FloatArray, rays: FloatArray, error: float, least: int = 4
+    points: FloatArray, rays: FloatArray, error: float, least: int = 4, tightened: bool = False
 ) -> tuple[gtsam.Pose3, BoolArray] | None:
     """camera_T_points of known points that a camera sees, and which of them fit it.
 
@@ -27,6 +31,8 @@ def camera_pose(
         rays: (N, 2) where the camera sees them, on its plane z = 1.
         error: largest error on that plane of a point that fits.
         least: how many points must fit the best sample.
+        tightened: whether the points that fit are chosen again by their own errors, not all of
+            those within `error`: something that moves slowly would pull the pose.
 
     Returns:
         The pose, and (N,) which points are in front of the camera and fit; None without a pose.
@@ -49,8 +55,24 @@ def camera_pose(
     rotation, translation = cv2.solvePnPRefineLM(
         points[chosen], rays[chosen], np.eye(3), None, rotation, translation
     )
-    seen = cv2.projectPoints(points, rotation, translation, np.eye(3), None)[0][:, 0]
+    for _ in range(_TIGHTENED if tightened else 0):
+        errors = _errors(points, rays, rotation, translation)
+        median = float(np.median(errors[errors < error]))
+        chosen = np.flatnonzero(errors < min(error, _MEDIANS * median))
+        if len(chosen) < max(least, _FEWEST):
+            break
+        rotation, translation = cv2.solvePnPRefineLM(
+            points[chosen], rays[chosen], np.eye(3), None, rotation, translation
+        )
     matrix = cv2.Rodrigues(rotation)[0]
     ahead = (points @ matrix.T + translation.T)[:, 2] > 0
     pose = gtsam.Pose3(gtsam.Rot3(matrix), translation[:, 0])
-    return pose, (np.linalg.norm(seen - rays, axis=1) < error) & ahead
+    return pose, (_errors(points, rays, rotation, translation) < error) & ahead
+
+
+def _errors(
+    points: FloatArray, rays: FloatArray, rotation: MatLike, translation: MatLike
+) -> FloatArray:
+    """How far (N,) points are from where they are seen, on the plane z = 1."""
+    seen = cv2.projectPoints(points, rotation, translation, np.eye(3), None)[0][:, 0]
+    return np.asarray(np.linalg.norm(seen - rays, axis=1))

@@ -102,7 +102,12 @@ class RigCamera:
     rotation_known: bool = True
 
     def body_pose(
-        self, points: FloatArray, rays: FloatArray, error_px: float, least: int = 4
+        self,
+        points: FloatArray,
+        rays: FloatArray,
+        error_px: float,
+        least: int = 4,
+        tightened: bool = False,
     ) -> tuple[gtsam.Pose3, BoolArray] | None:
         """world_T_body by points that this camera sees (PnP with RANSAC), and which of them fit it.
 
@@ -111,12 +116,13 @@ class RigCamera:
             rays: (N, 2) where the camera sees them, on its plane z = 1.
             error_px: largest error of a point that fits.
             least: how many points must fit.
+            tightened: see `camera_pose`.
 
         Returns:
             The pose, and (N,) which points are in front of the camera and fit; None without a pose.
         """
         focal_px = float(np.sqrt(self.camera.fx * self.camera.fy))
-        found = camera_pose(points, rays, error_px / focal_px, least)
+        found = camera_pose(points, rays, error_px / focal_px, least, tightened)
         if found is None:
             return None
         camera_T_world, fits = found

@@ -19,6 +19,7 @@ from gtsam.symbol_shorthand import L
 
 from slam_graph.arrays import BoolArray, IntArray
 from slam_graph.backend.backend_config import BackendConfig
+from slam_graph.backend.cost.consensus_gate import gate_by_consensus
 from slam_graph.backend.cost.cost import Cost, Linearization, TrackFeatures
 from slam_graph.backend.cost.feature_factors import WhitenedObservations
 from slam_graph.backend.cost.feature_selection import FeatureSelection, seen_by_leaving
@@ -112,7 +113,18 @@ class CostConstruction:
         config: BackendConfig,
         diagnostics: Diagnostics,
         pixels: PixelNoise,
+        vague: bool = False,
     ) -> None:
+        """Take what all steps have in common.
+
+        Args:
+            policy: which poses and features are in the cost.
+            rig: the cameras.
+            config: settings that do not depend on the algorithm.
+            diagnostics: counts what is rejected.
+            pixels: the noise of observations.
+            vague: whether nothing but images tells the pose of a new frame.
+        """
         self.policy = policy
         self.rig = rig
         self.config = config
@@ -123,6 +135,7 @@ class CostConstruction:
         self._selection = FeatureSelection(policy, rig, config, diagnostics, pixels)
         self._select_poses = POSE_SELECTIONS[policy.past_poses]
         self._loss = RobustLoss(config.gating.loss)
+        self._vague = vague
         self._failures: dict[int, int] = {}
 
     def construct(self, window: Window, still: bool) -> ConstructedCost:
@@ -287,7 +300,7 @@ class CostConstruction:
         entered = None
         if self._features.relinearized and cost.tracks is not None:
             entered = is_in(cost.tracks.obs.ids, window.kept_points[0])
-        gate = cost.gate(linear, predicted, None if entered is None else ~entered)
+        gate = self._gate(cost, linear, predicted, None if entered is None else ~entered)
         if entered is not None and cost.tracks is not None:
             passed = gate.tracks | entered
             dof = np.append(
@@ -301,6 +314,20 @@ class CostConstruction:
             )
             gate = replace(gate, tracks=passed, innovations=innovations)
         return gate, self._leave_out(cost, linear, gate, removals)
+
+    def _gate(
+        self,
+        cost: Cost,
+        linear: Linearization,
+        predicted: SquareRootInformation,
+        tested: BoolArray | None,
+    ) -> Gate:
+        """What passes the χ² test, by the prediction or by what most features show."""
+        if self._loss.vanishes:
+            linear = linear.unweighted(self._loss)
+        if self._vague:
+            return gate_by_consensus(cost, linear, predicted, tested)
+        return cost.gate(linear, predicted, tested)
 
     def _leave_out(
         self, cost: Cost, linear: Linearization, gate: Gate, removals: Removals

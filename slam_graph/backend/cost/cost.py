@@ -14,7 +14,6 @@ from dataclasses import dataclass, field, replace
 
 import gtsam
 import numpy as np
-from gtsam.symbol_shorthand import X
 from numpy.typing import NDArray
 
 from slam_graph.arrays import BoolArray, FloatArray, IntArray
@@ -33,12 +32,17 @@ from slam_graph.backend.cost.gating import (
     distances_of_tracks,
     threshold,
 )
-from slam_graph.backend.cost.measurement_rows import pose_rows, state_feature_rows
+from slam_graph.backend.cost.measurement_rows import (
+    columns_of_state,
+    pose_rows,
+    starts_of_points,
+    state_feature_rows,
+)
 from slam_graph.backend.cost.reprojection import Geometry, RigProjection
 from slam_graph.backend.cost.robust_loss import RobustLoss
 from slam_graph.backend.cost.triangulation import first_centres, moved_in_inverse_depth
 from slam_graph.backend.solve.square_root import Layout, SquareRootInformation
-from slam_graph.backend.solve.state import POINT_DIM, POSE_DIM, State, dims_of, landmark_keys
+from slam_graph.backend.solve.state import POINT_DIM, State, dims_of, landmark_keys
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -89,6 +93,12 @@ class Linearization:
             return Linearization(landmarks, tracks, stacked)
         total = sum_features(summed, tracks) if len(summed) else None
         return Linearization(landmarks, total, stacked)
+
+    def unweighted(self, loss: RobustLoss) -> Linearization:
+        """The same without the weights of a loss; features must not be summed up."""
+        assert not isinstance(self.tracks, SummedFeatures), "these have been weighted"
+        parts = [None if p is None else p.unweighted(loss) for p in (self.landmarks, self.tracks)]
+        return Linearization(parts[0], parts[1], self.errors)
 
 
 @dataclass(eq=False)
@@ -278,7 +288,7 @@ class Cost:
         if linear.landmarks is not None and self.landmarks is not None:
             obs = self.landmarks
             of_state = layout.indices(self.rig.keys_of(obs))
-            own = _starts_of_points(obs, layout)
+            own = starts_of_points(obs, layout)
             leading, rest = state_feature_rows(obs, linear.landmarks, own, of_state, size)
         if linear.tracks is None or self.tracks is None:
             return [leading, pose_rows(rest, None, none, none, (of_state, none), size)]
@@ -328,7 +338,8 @@ class Cost:
         """Which tracked observations and new features pass the χ² test.
 
         Args:
-            linear: of this cost, not summed up.
+            linear: of this cost, not summed up. Under the weights of a loss that vanish for large
+                residuals any would pass (`Linearization.unweighted`).
             predicted: what is known of the variables before these measurements.
             tested: (J,) which of the new features are tested; all of them if it is not given.
         """
@@ -370,27 +381,10 @@ class Cost:
         """Columns of observations of features of the state (N, 9 + C), and of those of tracks."""
         columns, of_poses = np.zeros((0, 9), np.intp), np.zeros(0, np.intp)
         if linear.landmarks is not None and self.landmarks is not None:
-            columns = self._state_columns(self.landmarks, layout)
+            columns = columns_of_state(self.landmarks, layout, self.rig.common_keys)
         if linear.tracks is not None and self.tracks is not None:
             of_poses = layout.indices(self.rig.keys_of(self.tracks.obs))
         return columns, of_poses
-
-    def _state_columns(self, obs: Observations, layout: Layout) -> NDArray[np.intp]:
-        """Columns (N, 9 + C) of each observation: its pose, its feature, and the calibration."""
-        poses = np.array([layout.starts[X(i)] for i in obs.frames])
-        points = _starts_of_points(obs, layout)
-        calibration = layout.indices(self.rig.common_keys)
-        own = POSE_DIM + POINT_DIM
-        columns = np.empty((len(obs), own + len(calibration)), np.intp)
-        columns[:, :POSE_DIM] = poses[obs.frame][:, None] + np.arange(POSE_DIM)
-        columns[:, POSE_DIM:own] = points[obs.feature][:, None] + np.arange(POINT_DIM)
-        columns[:, own:] = calibration
-        return columns
-
-
-def _starts_of_points(obs: Observations, layout: Layout) -> NDArray[np.intp]:
-    """The first column (J,) of each feature of the state; 0 of others, which have no rows."""
-    return np.array([layout.starts.get(key, 0) for key in landmark_keys(obs.ids)], np.intp)
 
 
 def _are_same(some: tuple[object, ...], others: tuple[object, ...]) -> bool:

@@ -144,6 +144,13 @@ class WhitenedObservations:
         parts = self.r, self.by_pose, self.by_point, self.by_calibration, self.depths, self.errors
         return WhitenedObservations(*(part.take(rows, axis=0) for part in parts))
 
+    def unweighted(self, loss: RobustLoss) -> WhitenedObservations:
+        """The same without the weights of a loss."""
+        scale = 1.0 / np.sqrt(loss.weights(self.errors))
+        r, wide = self.r * scale[:, None], scale[:, None, None]
+        parts = self.by_pose * wide, self.by_point * wide, self.by_calibration * wide
+        return WhitenedObservations(r, *parts, self.depths, self.errors)
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ReducedFeatures:

@@ -11,14 +11,17 @@ So an update leaves out most zeros (`updated` in `square_root.py`): half of its 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
+from gtsam.symbol_shorthand import X
 from numpy.typing import NDArray
 
 from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.backend.cost.feature_factors import SummedFeatures, WhitenedObservations
 from slam_graph.backend.cost.feature_tracks import Observations
-from slam_graph.backend.solve.square_root import triangularize
-from slam_graph.backend.solve.state import POINT_DIM
+from slam_graph.backend.solve.square_root import Layout, triangularize
+from slam_graph.backend.solve.state import POINT_DIM, POSE_DIM, landmark_keys
 from slam_graph.kernels.state_rows import fill_state_rows
 
 
@@ -85,3 +88,28 @@ def pose_rows(
         Ab[last:, columns[1]] = tracks.T[new].reshape(len(own), -1)
         Ab[last:, -1] = tracks.r_1[new].ravel()
     return Ab
+
+
+def columns_of_state(
+    obs: Observations, layout: Layout, common_keys: Sequence[int]
+) -> NDArray[np.intp]:
+    """Columns (N, 9 + C) of each observation: its pose, its feature, and what all have in common.
+
+    Args:
+        obs: of features of the state.
+        layout: of the variables.
+        common_keys: of the calibration.
+    """
+    poses = np.array([layout.starts[X(i)] for i in obs.frames])
+    points, calibration = starts_of_points(obs, layout), layout.indices(common_keys)
+    own = POSE_DIM + POINT_DIM
+    columns = np.empty((len(obs), own + len(calibration)), np.intp)
+    columns[:, :POSE_DIM] = poses[obs.frame][:, None] + np.arange(POSE_DIM)
+    columns[:, POSE_DIM:own] = points[obs.feature][:, None] + np.arange(POINT_DIM)
+    columns[:, own:] = calibration
+    return columns
+
+
+def starts_of_points(obs: Observations, layout: Layout) -> NDArray[np.intp]:
+    """The first column (J,) of each feature of the state; 0 of others, which have no rows."""
+    return np.array([layout.starts.get(key, 0) for key in landmark_keys(obs.ids)], np.intp)

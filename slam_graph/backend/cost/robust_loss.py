@@ -33,6 +33,11 @@ class RobustLoss:
     name: LossName = "huber"
     width: float = WIDTH_2D
 
+    @property
+    def vanishes(self) -> bool:
+        """Whether the weight of large residuals goes to zero, faster than they grow."""
+        return self.name == "cauchy"
+
     def weights(self, error: FloatArray) -> FloatArray:
         """Weights (N,) of iteratively reweighted least squares for lengths (N,)."""
         if self.name == "huber":
