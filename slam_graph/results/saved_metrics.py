@@ -17,13 +17,13 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from slam_graph.errors import DataError
 from slam_graph.files import Files
 
-_Time = Annotated[int, Field(gt=-Files.LARGEST_STAMP_NS, le=Files.LARGEST)]
+_Time = Annotated[int, Field(gt=-Files.LARGEST_STAMP_NS, lt=Files.LARGEST_STAMP_NS)]
 """A time in ns; differences of two of them fit into 64 bits."""
 
 _Alignment = Literal["none", "yaw", "se3", "sim3"]
 """Alignments that errors of runs are given for."""
 
-_Count = Annotated[int, Field(ge=0, lt=Files.LARGEST_STAMP_NS)]
+_Count = Annotated[int, Field(ge=0, le=Files.LARGEST)]
 _Amount = Annotated[float, Field(ge=0.0, le=Files.LARGEST)]
 
 
