@@ -25,6 +25,8 @@ from slam_graph.backend.solve.square_root import SquareRootInformation
 
 _FEWEST, _LEAST_SHARE = 10, 0.5
 """Fewer features, or a smaller part of them, are no consensus."""
+_CONFIDENCE = 0.99
+"""Share of the good features without a consensus that pass the second test."""
 _MEDIAN_2D = 1.18
 """Median length of a two-dimensional normal error, in standard deviations."""
 
@@ -62,7 +64,8 @@ def gate_by_consensus(
         moved = posterior.solution()
     except np.linalg.LinAlgError:
         return first
-    second = cost.gate(_after(cost, linear, moved, predicted), posterior.shifted(-moved), tested)
+    after = _after(cost, linear, moved, predicted)
+    second = cost.gate(after, posterior.shifted(-moved), tested, _CONFIDENCE)
     landmarks = first.landmarks & (fitting.landmarks | second.landmarks)
     tracks = first.tracks & (fitting.tracks | second.tracks)
     left_out = np.count_nonzero(first.landmarks & ~landmarks)

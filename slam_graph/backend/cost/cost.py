@@ -334,6 +334,7 @@ class Cost:
         linear: Linearization,
         predicted: SquareRootInformation,
         tested: BoolArray | None = None,
+        confidence: float | None = None,
     ) -> Gate:
         """Which tracked observations and new features pass the χ² test.
 
@@ -342,10 +343,11 @@ class Cost:
                 residuals any would pass (`Linearization.unweighted`).
             predicted: what is known of the variables before these measurements.
             tested: (J,) which of the new features are tested; all of them if it is not given.
+            confidence: share of good ones that pass; that of the settings if it is not given.
         """
         landmarks = np.zeros(0, np.bool_)
         tracks = np.zeros(0, np.bool_)
-        innovations, confidence = Innovations(), self.config.gating.confidence
+        innovations, confidence = Innovations(), confidence or self.config.gating.confidence
         columns, of_poses = self._gated_columns(linear, predicted.layout)
         first = min(int(part.min(initial=predicted.layout.size)) for part in (columns, of_poses))
         if first == predicted.layout.size:  # no observations
