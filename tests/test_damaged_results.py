@@ -185,6 +185,16 @@ def test_metrics_of_another_kind_are_refused(saved: Path, tmp_path: Path, fault:
         sg.load_result(folder).metrics  # noqa: B018
 
 
+@pytest.mark.parametrize("start_ns", [1_403_636_579_763_555_584, 2**62 - 1, 1 - 2**62])
+def test_metrics_of_any_time_are_read(saved: Path, tmp_path: Path, start_ns: int) -> None:
+    """Of the clock of a computer, and the first and the last that a recording may have."""
+    folder = shutil.copytree(saved, tmp_path / "run")
+    table = json.loads((folder / "metrics.json").read_text())
+    table["extent"]["start_ns"] = table["dataset"]["start_ns"] = start_ns
+    (folder / "metrics.json").write_text(json.dumps(table))
+    assert sg.load_result(folder).metrics["extent"]["start_ns"] == start_ns
+
+
 @pytest.mark.parametrize("text", ["[" * 100_000, '{"a": ' * 100_000, "1" * 5000, "NaN", "[]"])
 def test_json_that_is_no_table_is_refused(saved: Path, tmp_path: Path, text: str) -> None:
     folder = shutil.copytree(saved, tmp_path / "run")

@@ -17,7 +17,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from slam_graph.errors import DataError
 from slam_graph.files import Files
 
-_Time = Annotated[int, Field(gt=-Files.LARGEST_STAMP_NS, le=Files.LARGEST)]
+_Time = Annotated[int, Field(gt=-Files.LARGEST_STAMP_NS, lt=Files.LARGEST_STAMP_NS)]
 """A time in ns; differences of two of them fit into 64 bits."""
 
 _Alignment = Literal["none", "yaw", "se3", "sim3"]
