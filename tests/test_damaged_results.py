@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 from damage import CAMPAIGN, tried
-from sound import sound_rig, sound_table, sound_trajectory
+from sound import sound_rig, sound_stamps, sound_table, sound_trajectory
 
 import slam_graph as sg
 from slam_graph.cli import view_files
@@ -78,15 +78,22 @@ def read_run(run: SavedRun) -> None:
             sound_trajectory(path)
     for sigmas in (run.sigmas, run.smoothed_sigmas):
         assert sigmas is None or sigmas.shape[1] == 15
+        assert sigmas is None or np.isfinite(sigmas[~np.isnan(sigmas)] ** 2).all()
     assert np.isfinite(run.points**2).all()
     for text in (repr(run), thumbnail(run), run.status, run.message, str(run._facts())):
         assert isinstance(text, str)
     view = run._view()
     assert all(np.isfinite(path.positions).all() for path in view.paths.values())
-    assert set(map(len, (*run.timing.values(), *run.by_frame.values()))) <= set(range(FRAMES + 3))
-    assert run.keyframes_ns.dtype == run.loop_ends_ns.dtype == np.int64
+    for table in (run.timing, run.by_frame):
+        sound_stamps(table["stamp_ns"])
+        assert {len(column) for column in table.values()} == {len(table["stamp_ns"])}
+        for values in (column for title, column in table.items() if title != "stamp_ns"):
+            assert np.isfinite(values[~np.isnan(values)] ** 2).all()
+    sound_stamps(run.keyframes_ns, *run.loop_ends_ns.reshape(-1, 1))
     nees = run.nees_series
-    assert nees is None or np.isfinite(nees[1]).all()
+    if nees is not None:
+        sound_stamps(nees[0])
+        assert np.isfinite(nees[1]).all()
     _measured(run.metrics)
     if CAMPAIGN and run.metrics["status"] != "ok":  # it takes a second
         run.plot()
