@@ -39,6 +39,9 @@ _REACH = 0.7
 and some more, as points on a slanted surface are farther apart."""
 _MOST_PIXELS = 2e8
 """Most pixels of the camera that an image of the depth sensor is spread over, one by one."""
+_LARGEST_CAMERA = 2**25
+"""Most pixels of a camera that depth is registered to; its images may be missing, so that nothing
+else tells that its calibrated size is wrong."""
 
 
 class DepthStream(Protocol):
@@ -149,9 +152,17 @@ class Registration:
         lens: intrinsics of the depth camera.
         camera: that the depth is registered to.
         camera_T_depth: pose of the depth camera in the frame of the camera.
+
+    Raises:
+        DataError: if the calibration would take memory or time out of proportion.
     """
 
     def __init__(self, lens: Camera, camera: Camera, camera_T_depth: gtsam.Pose3) -> None:
+        if camera.width * camera.height > _LARGEST_CAMERA:
+            raise DataError(
+                f"calibration of the depth sensor: its camera has {camera.width}x{camera.height} "
+                "pixels, too many to register depth to; correct the resolution"
+            )
         u, v = np.meshgrid(np.arange(lens.width), np.arange(lens.height))
         pixels = np.column_stack([u.ravel(), v.ravel()]).astype(np.float64)
         plane, visible = lens.visible(pixels)
