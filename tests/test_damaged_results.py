@@ -22,7 +22,7 @@ from slam_graph.errors import DataError
 from slam_graph.experiment.batch_summary import _measured
 from slam_graph.experiment.batch_task import MARK, _read_mark
 from slam_graph.experiment.comparison_report import _cells, _row
-from slam_graph.experiment.comparison_results import read_result, write_result
+from slam_graph.experiment.comparison_results import read_result, read_series, write_result
 from slam_graph.experiment.path_thumbnail import thumbnail
 from slam_graph.results import SavedRun
 from slam_graph.results.map_output import read_ply
@@ -136,6 +136,47 @@ def test_results_of_a_comparison(result: sg.RunResult, tmp_path: Path) -> None:
     write_result(path, result, about)
     assert Done(path).is_done()
     tried(path, lambda: _cells(_row("flight", "msckf", [Done(path)])))  # type: ignore[list-item]
+
+
+COMPARED: dict[str, tuple[list[str], object]] = {
+    "no steps": (["mean_steps"], ...),
+    "no alignment": (["metrics", "extent", "unmeasured"], ...),
+    "steps without end": (["mean_steps"], 10**400),
+    "a number that is none": (["metrics", "nees"], {"pose": {"mean": 10**400}}),
+    "nothing expected": (["metrics", "nis"], {"mean": 1.0, "expected_mean": 0.0}),
+}
+
+
+@pytest.mark.parametrize("fault", COMPARED)
+def test_a_comparison_is_done_again_or_has_a_row(
+    result: sg.RunResult, tmp_path: Path, fault: str
+) -> None:
+    path = tmp_path / "msckf.json"
+    about = {"data": "flight", "algorithm": "msckf", "seed": 0, "settings_hash": "1"}
+    write_result(path, result, about)
+    keys, value = COMPARED[fault]
+    table = whole = json.loads(path.read_text())
+    for key in keys[:-1]:
+        table = table[key]
+    table[keys[-1]] = value
+    if value is ...:
+        del table[keys[-1]]
+    path.write_text(json.dumps(whole))
+    assert _cells(_row("flight", "msckf", [Done(path)]))  # type: ignore[list-item]
+
+
+@pytest.mark.parametrize("kind", ["text", "cube", "number", "long"])
+@pytest.mark.parametrize("series", ["ms_backend", "path", "nis_time_s", "steps"])
+def test_series_of_a_comparison_are_checked(
+    result: sg.RunResult, tmp_path: Path, series: str, kind: str
+) -> None:
+    path = tmp_path / "msckf.json"
+    write_result(path, result, {"settings_hash": "1"})
+    arrays = read_series(path)
+    other = {**OTHER_SERIES, "long": np.ones(1000)}[kind]
+    np.savez(path.with_suffix(".npz"), **arrays | {series: np.asarray(other)})
+    with pytest.raises(DataError, match=r"msckf\.npz: not the series of a run \('"):
+        read_series(path)
 
 
 def test_what_a_batch_says_of_a_run(tmp_path: Path) -> None:
