@@ -9,21 +9,24 @@ any amount.
 import logging
 import shutil
 import time
+from dataclasses import astuple, replace
 from pathlib import Path
 
+import gtsam
 import numpy as np
 import pytest
 from damage import tried
 from generated_rigs import rigs
 from hypothesis import given
 from hypothesis import strategies as st
-from properties import examples, parsed
+from properties import examples, parsed, poses
 from sound import sound_table, sound_trajectory
 
 import slam_graph as sg
 from slam_graph.datasets import RecordedSequence, open_dataset
 from slam_graph.datasets.calibration.kalibr_calibration import write_kalibr
 from slam_graph.results import SavedRun
+from slam_graph.sensors import ImuNoise, Rig
 from slam_graph.simulation.simulator import simulate
 
 pytestmark = pytest.mark.filterwarnings("error::RuntimeWarning")
@@ -84,6 +87,31 @@ def test_calibrations(flight: Path, tmp_path: Path, algorithm: str, start: str) 
     tried(folder / "calibration.yaml", read, IN_CI, MOST_S)
 
 
+@st.composite
+def wrong(draw: st.DrawFn, rig: Rig) -> Rig:
+    """A rig like another: lenses, mountings, clocks and noise off by factors, some of them much."""
+
+    def factor(most: float) -> float:
+        return 10.0 ** (most * draw(st.sampled_from([0.0, 0.0, draw(st.floats(-1.0, 1.0))])))
+
+    mounted = []
+    for one in rig.cameras:
+        camera, place = one.camera, one.body_T_camera
+        turn = draw(st.sampled_from([gtsam.Pose3(), draw(poses(1.0))])).rotation()
+        camera = replace(
+            camera,
+            fx=camera.fx * factor(1.0),
+            fy=camera.fy * factor(0.3),
+            cx=camera.cx * factor(0.3),
+            coefficients=tuple(value * factor(1.0) for value in camera.coefficients),
+        )
+        moved = gtsam.Pose3(place.rotation().compose(turn), place.translation() * factor(4.0))
+        offset_s = draw(st.sampled_from([0.0, 0.0, draw(st.floats(-3.0, 3.0))]))
+        mounted.append(replace(one, camera=camera, body_T_camera=moved, time_offset_s=offset_s))
+    noise = ImuNoise(*(value * factor(5.0) for value in astuple(rig.imu)))
+    return Rig(tuple(mounted), noise)
+
+
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
 @examples(5)
 @given(data=st.data())
@@ -95,7 +123,8 @@ def test_calibrations_of_any_sensors(
     if not base.exists():
         base.mkdir()
         without_start(flight, base / "sought")
-    write_kalibr(data.draw(rigs(2)), base / "chain.yaml")
+    rig = open_dataset(flight).rig
+    write_kalibr(data.draw(wrong(rig) | wrong(rig) | rigs(2)), base / "chain.yaml")
     folder = data.draw(st.sampled_from([flight, base / "sought"]))
     begin_s = time.process_time()
     parsed(
