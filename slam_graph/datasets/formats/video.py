@@ -30,10 +30,10 @@ from slam_graph.datasets.streams.image_sequence import (
     check_size,
     require_size,
 )
-from slam_graph.datasets.streams.image_size import fault_of_claim
 from slam_graph.datasets.streams.images import Fault, Image, prefetch
 from slam_graph.datasets.streams.pairing import Groups, group_by_time, in_order
 from slam_graph.errors import DataError
+from slam_graph.image_files import fault_of_claim
 from slam_graph.sensors import CameraFrame
 
 SUFFIXES = {".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v", ".mpg", ".mpeg", ".mjpeg", ".h264"}

@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam_graph.arrays import IntArray
-from slam_graph.datasets.streams.image_size import JPEG_SIGNATURE, PNG_SIGNATURE, fault_of_size
 from slam_graph.errors import DataError
+from slam_graph.image_files import JPEG_SIGNATURE, PNG_SIGNATURE, decode_image
 
 T = TypeVar("T")
 
@@ -125,14 +125,8 @@ def decoded(data: bytes, flags: int) -> NDArray[Any] | str:
         data: bytes of the file.
         flags: OpenCV's, of `cv2.imdecode`.
     """
-    damage = find_damage(data) or fault_of_size(data)
-    if damage is not None:
-        return damage
-    try:
-        image: NDArray[Any] | None = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
-    except cv2.error as error:
-        return str(error.err)
-    return "not an image that OpenCV can read" if image is None else image
+    damage = find_damage(data)
+    return decode_image(data, flags) if damage is None else damage
 
 
 def find_damage(data: bytes) -> str | None:

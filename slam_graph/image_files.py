@@ -1,14 +1,20 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""Width and height that an image file claims, read from its first bytes.
+"""Image files are decoded only if they can hold the pixels that they claim.
 
-A decoder takes memory for what is claimed: a damaged JPEG of 400 bytes may claim 10⁹ pixels.
+A decoder takes memory for what is claimed: a damaged JPEG of 400 bytes may claim 10⁹ pixels. So
+width and height are read from the first bytes before.
 """
 
 from __future__ import annotations
 
 import re
 import struct
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
 
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 JPEG_SIGNATURE = b"\xff\xd8"
@@ -32,7 +38,24 @@ _MOST_TAGS = 1000
 Size = tuple[int, int]
 
 
-def fault_of_size(data: bytes) -> str | None:
+def decode_image(data: bytes, flags: int) -> NDArray[Any] | str:
+    """The image in the bytes of a file, or what is wrong with them.
+
+    Args:
+        data: bytes of the file.
+        flags: OpenCV's, of `cv2.imdecode`.
+    """
+    fault = _fault_of_size(data)
+    if fault is not None:
+        return fault
+    try:
+        image: NDArray[Any] | None = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+    except cv2.error as error:
+        return str(error.err)
+    return "not an image that OpenCV can read" if image is None else image
+
+
+def _fault_of_size(data: bytes) -> str | None:
     """Why an image file is not to be decoded, by its format and claimed size; None if it is."""
     try:
         size = _claimed_size(data)
