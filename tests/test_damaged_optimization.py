@@ -25,7 +25,7 @@ from slam_graph.results import BalResult, PoseGraphResult
 
 pytestmark = pytest.mark.filterwarnings("error::RuntimeWarning")
 
-IN_CI = 12
+IN_CI = 8
 """Ways in which a file is damaged, for each method."""
 
 

@@ -31,7 +31,7 @@ from slam_graph.simulation.simulator import simulate
 
 pytestmark = pytest.mark.filterwarnings("error::RuntimeWarning")
 
-IN_CI = 4
+IN_CI = 3
 """Ways in which a calibration is damaged, for each algorithm."""
 
 MOST_S = 20.0
@@ -56,7 +56,10 @@ def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def run_all(output: Path, sequence: RecordedSequence, algorithm: str) -> None:
-    """Run, and write the results: all numbers are finite, and nothing is beside them."""
+    """Run, and write the results: all numbers are finite, and nothing is beside them.
+
+    Pictures take most of the time, so the files of one algorithm stand for those of all.
+    """
     shutil.rmtree(output, ignore_errors=True)
     result = sg.run(sequence, algorithm=algorithm)
     for path in (result.trajectory, result.smoothed):
@@ -65,6 +68,8 @@ def run_all(output: Path, sequence: RecordedSequence, algorithm: str) -> None:
     assert np.isfinite(result.points**2).all()
     sound_table(result.metrics)
     assert "\n" not in result.message
+    if algorithm != "msckf":
+        return
     result.save(output / "run")
     assert [path.name for path in output.iterdir()] == ["run"]
     sound_table(SavedRun(output / "run").metrics)
@@ -113,7 +118,7 @@ def wrong(draw: st.DrawFn, rig: Rig) -> Rig:
 
 
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
-@examples(5)
+@examples(2)
 @given(data=st.data())
 def test_calibrations_of_any_sensors(
     flight: Path, tmp_path_factory: pytest.TempPathFactory, algorithm: str, data: st.DataObject

@@ -195,6 +195,15 @@ def test_a_camera_of_too_many_pixels_is_refused() -> None:
     assert memory_mb() < before_mb + MOST_MB
 
 
+@pytest.mark.parametrize("times", [40.0, 2000.0])
+def test_a_focal_length_of_another_kind_of_camera_is_refused(times: float) -> None:
+    """Each point would fill as many pixels squared: one small image took a minute."""
+    lens = Camera(1.0, 1.0, 3.0, 2.0, "none", (), *SIZE)
+    camera = replace(lens, fx=times, fy=times)
+    with pytest.raises(DataError, match=f"{times:.0f} times shorter"):
+        Registration(lens, camera, DepthSensor().camera_T_depth)
+
+
 # --- times ----------------------------------------------------------------------------------------
 
 STAMPS = st.lists(

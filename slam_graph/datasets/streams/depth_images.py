@@ -39,6 +39,9 @@ _REACH = 0.7
 and some more, as points on a slanted surface are farther apart."""
 _MOST_PIXELS = 2e8
 """Most pixels of the camera that an image of the depth sensor is spread over, one by one."""
+_LARGEST_RATIO = 32.0
+"""Largest focal length of the camera over that of the depth sensor: each point fills as many pixels
+squared, one after the other."""
 _LARGEST_CAMERA = 2**25
 """Most pixels of a camera that depth is registered to; its images may be missing, so that nothing
 else tells that its calibrated size is wrong."""
@@ -172,7 +175,7 @@ class Registration:
         self._origin = np.asarray(camera_T_depth.translation())
         self._camera = camera
         ratio = max(camera.fx / lens.fx, camera.fy / lens.fy, 1.0)
-        if ratio**2 * lens.width * lens.height > _MOST_PIXELS:
+        if ratio > _LARGEST_RATIO or ratio**2 * lens.width * lens.height > _MOST_PIXELS:
             raise DataError(
                 f"calibration of the depth sensor: its focal length is {ratio:.0f} times shorter "
                 "than that of its camera; correct its intrinsics"
