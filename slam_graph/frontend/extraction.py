@@ -15,7 +15,6 @@ from slam_graph.errors import ConfigError
 from slam_graph.frontend.detectors import refine
 from slam_graph.frontend.frontend_config import DETECTORS, FrontendConfig
 from slam_graph.frontend.keypoints import Image, Keypoints, Pixels, spread
-from slam_graph.image_files import decode_image
 from slam_graph.kernels.spacing import claim, clear_disks
 from slam_graph.sensors import Camera
 
@@ -292,10 +291,12 @@ def _read_mask(path: Path, width: int, height: int) -> Image:
     Raises:
         ConfigError: if it is missing, unreadable, or not of the size of the camera's images.
     """
-    image = decode_image(path.read_bytes(), cv2.IMREAD_GRAYSCALE) if path.is_file() else "no file"
-    if isinstance(image, str):
-        what = "the mask of a camera is missing or not a readable image"
-        raise ConfigError(f"{path}: {what} ({image})")
+    try:
+        image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) if path.is_file() else None
+    except cv2.error:  # it claims more pixels than OpenCV takes
+        image = None
+    if image is None:
+        raise ConfigError(f"{path}: the mask of a camera is missing or not a readable image")
     if image.shape != (height, width):
         raise ConfigError(
             f"{path}: the mask is {image.shape[1]}x{image.shape[0]}, "
