@@ -198,6 +198,12 @@ def test_classes(folder: Path, data: st.DataObject, classes: dict[int, str]) -> 
     assert read_classes(folder) == classes
 
 
+def test_a_class_of_no_label_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "classes.csv").write_text("65536,car\n")
+    with pytest.raises(DataError, match=r"classes\.csv:1: expected a label"):
+        read_classes(tmp_path)
+
+
 @examples(100)
 @given(content=ANYTHING | edited("7,car\n3,person on a bike\n# a,b\n\n300,bus\n"))
 def test_edited_classes(folder: Path, content: bytes) -> None:

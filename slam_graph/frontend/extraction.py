@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import struct
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -291,6 +292,12 @@ def _read_mask(path: Path, width: int, height: int) -> Image:
     Raises:
         ConfigError: if it is missing, unreadable, or not of the size of the camera's images.
     """
+    claimed = _png_size(path)
+    if claimed is not None and claimed != (width, height):  # it is not even decoded
+        raise ConfigError(
+            f"{path}: the mask is {claimed[0]}x{claimed[1]}, "
+            f"the camera's images are {width}x{height}"
+        )
     try:
         image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) if path.is_file() else None
     except cv2.error:  # it claims more pixels than OpenCV takes
@@ -303,3 +310,15 @@ def _read_mask(path: Path, width: int, height: int) -> Image:
             f"the camera's images are {width}x{height}"
         )
     return np.asarray(image, np.uint8)
+
+
+def _png_size(path: Path) -> tuple[int, int] | None:
+    """Width and height that a PNG claims; None if it is none."""
+    if not path.is_file():
+        return None
+    with path.open("rb") as file:
+        start = file.read(24)
+    if not start.startswith(b"\x89PNG") or len(start) < 24:
+        return None
+    width, height = struct.unpack(">II", start[16:])
+    return width, height

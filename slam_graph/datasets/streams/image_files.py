@@ -80,7 +80,7 @@ def _claimed_size(data: bytes) -> Size | None:
         struct.error: if it ends before them, too.
     """
     if data.startswith(PNG_SIGNATURE):
-        return _pair(">II", data, 16)
+        return _pair(">II", data, 16) if data[12:16] == b"IHDR" else None
     if data.startswith(JPEG_SIGNATURE):
         return _of_jpeg(data)
     if data.startswith(b"BM"):

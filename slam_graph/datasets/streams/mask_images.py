@@ -173,7 +173,8 @@ def read_classes(folder: Path) -> dict[int, str]:
         label, _, name = line.partition(",")
         if not line.strip() or line.startswith("#"):
             continue
-        if not re.fullmatch(r"[0-9]{1,5}", label.strip()) or not name.strip():
+        known = re.fullmatch(r"[0-9]{1,5}", label.strip()) and int(label) <= LARGEST_LABEL
+        if not known or not name.strip():
             raise DataError(f"{path}:{number}: expected a label and a name, got '{line[:40]}'")
         classes[int(label)] = " ".join(name.split())
     return classes
