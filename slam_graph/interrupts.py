@@ -155,6 +155,8 @@ def end_with(pipe: int) -> None:
     """End this process, as by Ctrl-C, when the other end of a pipe is closed.
 
     The process that holds that end need not do anything: it is closed also when it is killed.
+    Where SIGINT is ignored, as in a background job of a shell, SIGTERM takes its place
+    (see `terminate_like_interrupt`).
 
     Args:
         pipe: file descriptor to read from; nothing is ever written to it.
@@ -163,7 +165,8 @@ def end_with(pipe: int) -> None:
     def wait() -> None:
         while os.read(pipe, 1):
             continue
-        os.kill(os.getpid(), signal.SIGINT)
+        ignored = signal.getsignal(signal.SIGINT) == signal.SIG_IGN
+        os.kill(os.getpid(), signal.SIGTERM if ignored else signal.SIGINT)
         time.sleep(_GRACE_S)
         os.kill(os.getpid(), signal.SIGKILL)
 

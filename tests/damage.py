@@ -86,18 +86,26 @@ def token(content: bytes, at: int) -> tuple[int, int]:
     return begin, end
 
 
-def tried(file: Path, read: Callable[[], object]) -> None:
+def tried(
+    file: Path, read: Callable[[], object], in_ci: int = IN_CI, most_s: float = MOST_S
+) -> None:
     """Damage a file in many ways, and read it each time.
 
     All failures are collected, the first of each kind, each with its damaged file beside `file`.
+
+    Args:
+        file: a valid one.
+        read: reads it, and does what is to be done with what it says.
+        in_ci: how many ways, outside of campaigns.
+        most_s: time of the CPU that it may take.
     """
     whole = file.read_bytes()
     read()  # it is valid
     read()  # what is loaded once is loaded
     failures: dict[str, str] = {}
-    for number in range(CAMPAIGN or IN_CI):
+    for number in range(CAMPAIGN or in_ci):
         file.write_bytes(damaged(whole, edits(number)))
-        failure = failure_of(read)
+        failure = failure_of(read, most_s)
         if failure is not None and failure[0] not in failures:
             kept = shutil.copy(file, file.with_name(f"{file.name}.damaged{number}"))
             failures[failure[0]] = f"mutation {number} of seed {SEED}, kept as {kept}: {failure[1]}"
@@ -116,7 +124,7 @@ def memory_mb(reset: bool = False) -> float:
     return int(peak) / 1024
 
 
-def failure_of(read: Callable[[], object]) -> tuple[str, str] | None:
+def failure_of(read: Callable[[], object], most_s: float = MOST_S) -> tuple[str, str] | None:
     """What is wrong with how a damaged file is read: its kind and a text; None if nothing is."""
     begin_s, before_mb = time.process_time(), memory_mb(reset=True)
     try:
@@ -131,6 +139,6 @@ def failure_of(read: Callable[[], object]) -> tuple[str, str] | None:
         return kind, "".join(traceback.format_exception(error))
     taken_s = time.process_time() - begin_s
     more_mb = memory_mb() - before_mb
-    if taken_s > MOST_S or more_mb > MOST_MB:
+    if taken_s > most_s or more_mb > MOST_MB:
         return "cost", f"{taken_s:.1f} s and {more_mb:.0f} MB for a small file"
     return None

@@ -7,8 +7,11 @@ so many new examples of each property, as in `damage`.
 """
 
 import random
+import re
 from codecs import BOM_UTF8
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
 from typing import Any, TypeVar
 
 import gtsam
@@ -198,3 +201,52 @@ def dressed(
         lines.append(line + rng.choice(["", *blanks]))
     last, mark = draw(st.sampled_from(["", end])), draw(st.sampled_from([b"", BOM_UTF8]))
     return mark + (end.join(lines) + last).encode()
+
+
+def in_seconds(stamp_ns: int) -> str:
+    """A time in seconds with nine decimals."""
+    sign, size = "-" if stamp_ns < 0 else "", abs(stamp_ns)
+    return f"{sign}{size // 10**9}.{size % 10**9:09d}"
+
+
+_EDITS = ("word", "word", "word", "line", "twice", "gone", "moved")
+
+
+@st.composite
+def edited(draw: st.DrawFn, text: str, marks: str = " ,\t:") -> bytes:
+    """A valid text in which some words are others, or some lines twice, gone or elsewhere.
+
+    Args:
+        draw: of Hypothesis.
+        text: of lines.
+        marks: what separates words.
+    """
+    lines = text.splitlines()
+    for _ in range(draw(st.integers(1, 3))):
+        if not lines:
+            break
+        at, edit = draw(st.integers(0, len(lines) - 1)), draw(st.sampled_from(_EDITS))
+        if edit == "word":
+            parts = re.split(f"([{re.escape(marks)}]+)", lines[at])  # a mark after each word
+            parts[2 * draw(st.integers(0, len(parts) // 2))] = draw(TOKENS)
+            lines[at] = "".join(parts)
+        elif edit == "line":
+            lines[at] = draw(st.text(max_size=12))
+        elif edit == "twice":
+            lines.insert(draw(st.integers(0, len(lines))), lines[at])
+        else:
+            line = lines.pop(at)
+            if edit == "moved":
+                lines.insert(draw(st.integers(0, len(lines))), line)
+    return "\n".join(lines).encode("utf-8", "surrogatepass")
+
+
+@contextmanager
+def instead(path: Path, content: bytes) -> Iterator[None]:
+    """A file with another content within the block."""
+    whole = path.read_bytes()
+    try:
+        path.write_bytes(content)
+        yield
+    finally:
+        path.write_bytes(whole)

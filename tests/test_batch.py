@@ -204,11 +204,11 @@ def told(*_):
         time.sleep(0.01)
     (folder / f"{name}.ended").touch()
     sys.exit(1)
-signal.signal(signal.SIGINT, told)
+signal.signal(signal.SIGTERM, told)
 (folder / f"{name}.began").touch()
 time.sleep(600)
 """
-"""A process that ends upon SIGINT when all others have been told, too."""
+"""A process that ends upon SIGTERM when all others have been told, too."""
 
 
 def test_all_processes_are_told_before_one_is_waited_for(

@@ -29,7 +29,16 @@ from recordings import (
 from recordings_loose import CHAIN, write_flight_video, write_image_folder, write_video
 from recordings_public import as_tum_vi, write_kitti_odometry, write_kitti_raw, write_tum_rgbd
 from recordings_ros import BagWriter, write_bag
-from sound import sound_graph, sound_problem, sound_rig, sound_table, sound_trajectory
+from sound import (
+    sound_aiding,
+    sound_graph,
+    sound_map,
+    sound_problem,
+    sound_recording,
+    sound_rig,
+    sound_table,
+    sound_trajectory,
+)
 
 from slam_graph.bundle_adjustment.bal_file import read_bal
 from slam_graph.config import load_config
@@ -38,7 +47,7 @@ from slam_graph.datasets.calibration.kalibr_calibration import read_kalibr, writ
 from slam_graph.datasets.formats.eqvio import wheel_tracks
 from slam_graph.datasets.groundtruth import read_groundtruth
 from slam_graph.datasets.streams.aiding_files import read_aiding
-from slam_graph.datasets.streams.mask_images import MaskFolder
+from slam_graph.datasets.streams.mask_images import LARGEST_LABEL, MaskFolder
 from slam_graph.datasets.streams.object_truth import read_object_truth
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.frontend.extraction import camera_mask
@@ -62,24 +71,8 @@ def shorten(path: Path, lines: int) -> None:
 
 
 def read_all(path: Path, **options: Any) -> None:
-    """Everything that a run reads of a recording."""
-    sequence = open_dataset(path, **options)
-    sequence.info()
-    sound_rig(sequence.rig)
-    truth = sequence.groundtruth()
-    if truth is not None:
-        sound_trajectory(truth)
-    start = sequence.initial_state()
-    if start is not None:
-        assert np.isfinite(start.world_T_body.matrix()).all()
-        assert np.isfinite([start.velocity, start.gyro_bias, start.accel_bias]).all()
-    last_ns = None
-    for packet in sequence.packets():
-        assert last_ns is None or packet.frame.stamp_ns > last_ns
-        last_ns = packet.frame.stamp_ns
-        stamps = packet.imu.stamps_ns
-        assert np.all(stamps[1:] > stamps[:-1])  # their difference may be beyond 64 bits
-        assert np.isfinite([packet.imu.gyro, packet.imu.accel]).all()
+    """Everything that a run reads of a recording, which is sound."""
+    sound_recording(open_dataset(path, **options))
 
 
 TRUTH = "state_groundtruth_estimate0"
@@ -314,8 +307,11 @@ def test_masks_of_objects(tmp_path: Path, name: str) -> None:
 
     def read() -> None:
         masks = MaskFolder(tmp_path)
+        assert len(masks) > 0
+        assert set(masks.classes) <= set(range(LARGEST_LABEL + 1))
         for stamp_ns in (100, 20_000_000, 30_000_000):
-            masks.image(stamp_ns, (60, 40))
+            drawn = masks.image(stamp_ns, (60, 40))
+            assert drawn is None or (drawn.shape, drawn.dtype) == ((40, 60), np.uint16)
 
     tried(tmp_path / name, read)
 
@@ -324,7 +320,12 @@ def test_true_poses_of_objects(tmp_path: Path) -> None:
     path = tmp_path / "objects_truth.csv"
     rows = (f"{k},{1 + k % 2},{k},0.5,-1e-3,0,0,0.6,0.8\n" for k in range(1, 8))
     path.write_text("#timestamp_ns,object,x_m,y_m,z_m,qx,qy,qz,qw\n" + "".join(rows))
-    tried(path, lambda: read_object_truth(path))
+
+    def read() -> None:
+        for pose in read_object_truth(path).values():
+            sound_trajectory(pose)
+
+    tried(path, read)
 
 
 @pytest.fixture(scope="module")
@@ -342,14 +343,7 @@ def aiding(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def read_all_aiding(folder: Path) -> None:
     """Position fixes, known poses and odometry in the files of a folder."""
-    data = read_aiding([folder], {}, Diagnostics())
-    for stamps in (data.fix_stamps_ns, data.pose_stamps_ns, data.odometry_stamps_ns):
-        assert np.all(np.diff(stamps) > 0)
-    for positions in (data.fix_positions, data.pose_positions, data.odometry_positions):
-        assert np.isfinite(positions).all()
-    assert np.isfinite(data.fix_covariances).all()
-    for turns in (data.pose_quaternions, data.odometry_quaternions):
-        np.testing.assert_allclose(np.linalg.norm(turns, axis=1), 1.0, atol=0.02)
+    sound_aiding(read_aiding([folder], {}, Diagnostics()))
 
 
 GEODETIC = (
@@ -382,7 +376,7 @@ def test_aiding(aiding: Path, tmp_path: Path, name: str) -> None:
 def test_maps(tmp_path: Path) -> None:
     path = tmp_path / "a.slam"
     save_map(World().map(), path)
-    tried(path, lambda: load_map(path))
+    tried(path, lambda: sound_map(load_map(path)))
 
 
 def test_configurations(tmp_path: Path) -> None:

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 from damage import CAMPAIGN, tried
-from sound import sound_rig, sound_table, sound_trajectory
+from sound import sound_rig, sound_stamps, sound_table, sound_trajectory
 
 import slam_graph as sg
 from slam_graph.cli import view_files
@@ -22,7 +22,7 @@ from slam_graph.errors import DataError
 from slam_graph.experiment.batch_summary import _measured
 from slam_graph.experiment.batch_task import MARK, _read_mark
 from slam_graph.experiment.comparison_report import _cells, _row
-from slam_graph.experiment.comparison_results import read_result, write_result
+from slam_graph.experiment.comparison_results import read_result, read_series, write_result
 from slam_graph.experiment.path_thumbnail import thumbnail
 from slam_graph.results import SavedRun
 from slam_graph.results.map_output import read_ply
@@ -78,15 +78,22 @@ def read_run(run: SavedRun) -> None:
             sound_trajectory(path)
     for sigmas in (run.sigmas, run.smoothed_sigmas):
         assert sigmas is None or sigmas.shape[1] == 15
+        assert sigmas is None or np.isfinite(sigmas[~np.isnan(sigmas)] ** 2).all()
     assert np.isfinite(run.points**2).all()
     for text in (repr(run), thumbnail(run), run.status, run.message, str(run._facts())):
         assert isinstance(text, str)
     view = run._view()
     assert all(np.isfinite(path.positions).all() for path in view.paths.values())
-    assert set(map(len, (*run.timing.values(), *run.by_frame.values()))) <= set(range(FRAMES + 3))
-    assert run.keyframes_ns.dtype == run.loop_ends_ns.dtype == np.int64
+    for table in (run.timing, run.by_frame):
+        sound_stamps(table["stamp_ns"])
+        assert {len(column) for column in table.values()} == {len(table["stamp_ns"])}
+        for values in (column for title, column in table.items() if title != "stamp_ns"):
+            assert np.isfinite(values[~np.isnan(values)] ** 2).all()
+    sound_stamps(run.keyframes_ns, *run.loop_ends_ns.reshape(-1, 1))
     nees = run.nees_series
-    assert nees is None or np.isfinite(nees[1]).all()
+    if nees is not None:
+        sound_stamps(nees[0])
+        assert np.isfinite(nees[1]).all()
     _measured(run.metrics)
     if CAMPAIGN and run.metrics["status"] != "ok":  # it takes a second
         run.plot()
@@ -129,6 +136,47 @@ def test_results_of_a_comparison(result: sg.RunResult, tmp_path: Path) -> None:
     write_result(path, result, about)
     assert Done(path).is_done()
     tried(path, lambda: _cells(_row("flight", "msckf", [Done(path)])))  # type: ignore[list-item]
+
+
+COMPARED: dict[str, tuple[list[str], object]] = {
+    "no steps": (["mean_steps"], ...),
+    "no alignment": (["metrics", "extent", "unmeasured"], ...),
+    "steps without end": (["mean_steps"], 10**400),
+    "a number that is none": (["metrics", "nees"], {"pose": {"mean": 10**400}}),
+    "nothing expected": (["metrics", "nis"], {"mean": 1.0, "expected_mean": 0.0}),
+}
+
+
+@pytest.mark.parametrize("fault", COMPARED)
+def test_a_comparison_is_done_again_or_has_a_row(
+    result: sg.RunResult, tmp_path: Path, fault: str
+) -> None:
+    path = tmp_path / "msckf.json"
+    about = {"data": "flight", "algorithm": "msckf", "seed": 0, "settings_hash": "1"}
+    write_result(path, result, about)
+    keys, value = COMPARED[fault]
+    table = whole = json.loads(path.read_text())
+    for key in keys[:-1]:
+        table = table[key]
+    table[keys[-1]] = value
+    if value is ...:
+        del table[keys[-1]]
+    path.write_text(json.dumps(whole))
+    assert _cells(_row("flight", "msckf", [Done(path)]))  # type: ignore[list-item]
+
+
+@pytest.mark.parametrize("kind", ["text", "cube", "number", "long"])
+@pytest.mark.parametrize("series", ["ms_backend", "path", "nis_time_s", "steps"])
+def test_series_of_a_comparison_are_checked(
+    result: sg.RunResult, tmp_path: Path, series: str, kind: str
+) -> None:
+    path = tmp_path / "msckf.json"
+    write_result(path, result, {"settings_hash": "1"})
+    arrays = read_series(path)
+    other = {**OTHER_SERIES, "long": np.ones(1000)}[kind]
+    np.savez(path.with_suffix(".npz"), **arrays | {series: np.asarray(other)})
+    with pytest.raises(DataError, match=r"msckf\.npz: not the series of a run \('"):
+        read_series(path)
 
 
 def test_what_a_batch_says_of_a_run(tmp_path: Path) -> None:
@@ -183,6 +231,16 @@ def test_metrics_of_another_kind_are_refused(saved: Path, tmp_path: Path, fault:
     (folder / "metrics.json").write_text(json.dumps(whole))
     with pytest.raises(DataError, match=rf"metrics\.json: .*\({keys[0]}.*run again"):
         sg.load_result(folder).metrics  # noqa: B018
+
+
+@pytest.mark.parametrize("start_ns", [1_403_636_579_763_555_584, 2**62 - 1, 1 - 2**62])
+def test_metrics_of_any_time_are_read(saved: Path, tmp_path: Path, start_ns: int) -> None:
+    """Of the clock of a computer, and the first and the last that a recording may have."""
+    folder = shutil.copytree(saved, tmp_path / "run")
+    table = json.loads((folder / "metrics.json").read_text())
+    table["extent"]["start_ns"] = table["dataset"]["start_ns"] = start_ns
+    (folder / "metrics.json").write_text(json.dumps(table))
+    assert sg.load_result(folder).metrics["extent"]["start_ns"] == start_ns
 
 
 @pytest.mark.parametrize("text", ["[" * 100_000, '{"a": ' * 100_000, "1" * 5000, "NaN", "[]"])

@@ -11,6 +11,7 @@ from zlib import crc32
 
 import numpy as np
 import pytest
+from damage import MOST_MB, memory_mb
 from hostile import ALIASES, read_all
 from recordings import edit_text, write_euroc, write_openvins
 from recordings_loose import write_times, write_video
@@ -362,8 +363,20 @@ def test_masks_that_claim_too_much_are_refused(tmp_path: Path) -> None:
         header = b"IHDR" + size + size + b"\x08\x00\x00\x00\x00"
         chunk = (13).to_bytes(4, "big") + header + crc32(header).to_bytes(4, "big")
         mask.write_bytes(b"\x89PNG\r\n\x1a\n" + chunk)
-        with pytest.raises(ConfigError, match=r"mask\.png: the mask of a camera"):
+        with pytest.raises(ConfigError, match=r"mask\.png: the mask of a camera is a damaged PNG"):
             camera_mask(simulate(duration_s=1.0).rig.cameras[0].camera, mask, 21)
+
+
+@pytest.mark.parametrize("chunk", [b"IDAT", b"IHDR"])
+def test_a_mask_that_claims_a_long_part_is_not_decoded(tmp_path: Path, chunk: bytes) -> None:
+    """OpenCV takes memory for it before it reads it: 700 MB for 16 bytes."""
+    mask = tmp_path / "mask.png"
+    mask.write_bytes(b"\x89PNG\r\n\x1a\n" + (757_000_000).to_bytes(4, "big") + chunk)
+    memory_mb(reset=True)
+    before_mb = memory_mb()
+    with pytest.raises(ConfigError, match=r"mask\.png: the mask of a camera is a damaged PNG"):
+        camera_mask(simulate(duration_s=1.0).rig.cameras[0].camera, mask, 21)
+    assert memory_mb() < before_mb + MOST_MB
 
 
 def test_bytes_that_are_no_text_are_refused(tmp_path: Path) -> None:

@@ -21,6 +21,7 @@ from properties import (
     dressed,
     examples,
     finite,
+    in_seconds,
     parsed,
     quaternions,
     rows_of,
@@ -87,8 +88,7 @@ def test_euroc_trajectories(folder: Path, data: st.DataObject) -> None:
 @examples()
 @given(st.integers(1 - SECONDS_NS, SECONDS_NS - 1), st.integers(0, 12))
 def test_seconds_are_exact_to_the_nanosecond(stamp_ns: int, zeros: int) -> None:
-    sign, size = "-" if stamp_ns < 0 else "", abs(stamp_ns)
-    text = f"{sign}{size // 10**9}.{size % 10**9:09d}"
+    text = in_seconds(stamp_ns)
     for written in (text, text + "0" * zeros, f"{stamp_ns}e-9", f" {text}\t"):
         assert nanoseconds(written) == stamp_ns
 

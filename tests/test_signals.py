@@ -18,6 +18,7 @@ import pytest
 from slam_graph.backend import FinalBa
 from slam_graph.config import load_config
 from slam_graph.experiment.comparison_results import read_result
+from slam_graph.experiment.executors import _stop, _TaskProcess
 from slam_graph.experiment.tasks import RecordTask, RunTask, find_sources
 from slam_graph.interrupts import Interrupts
 from slam_graph.pipeline import run
@@ -261,19 +262,21 @@ def test_damaged_results_are_done_again(tmp_path: Path) -> None:
         assert task.is_done()
 
 
-def test_a_task_ends_with_the_one_who_waits_for_it(tmp_path: Path) -> None:
+@pytest.mark.parametrize("ignored", [False, True], ids=["foreground", "background"])
+@pytest.mark.parametrize("by", ["pipe", "stop"])
+def test_a_task_ends_with_the_one_who_waits_for_it(tmp_path: Path, ignored: bool, by: str) -> None:
+    """When that one is gone, or stops it; also where a shell lets Ctrl-C be ignored."""
     source = find_sources(["sim:figure8"], 600.0)[0]
     task = RecordTask(source=source, seed=0, config=load_config(), root=tmp_path)
-    theirs, ours = os.pipe()
-    process = subprocess.Popen(
-        [sys.executable, "-m", "slam_graph.experiment.tasks", task.model_dump_json()],
-        stdin=theirs,
-        stderr=subprocess.DEVNULL,
-    )
-    os.close(theirs)
+    if ignored:
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+    process = _TaskProcess(task.model_dump_json())
     wait_for(lambda: list(tmp_path.glob(".*.partial")))
-    os.close(ours)
-    assert process.wait(HANG_S) != 0
+    if by == "stop":
+        _stop([process])
+    process.release()
+    process.communicate(timeout=HANG_S)
+    assert process.returncode == -signal.SIGINT  # as by Ctrl-C; it was not killed
     assert not list(tmp_path.iterdir())
 
 

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 _Show = Callable[["RerunRecording"], None]
 _ERRORS = ("time_s", "translation_m", "rotation_deg")
 _ERROR_TITLES = ("time_s", "position error [m]", "orientation error [deg]")
-_DAMAGED = (OSError, ValueError, KeyError, TypeError, AttributeError, EOFError)
+_DAMAGED = (OSError, ValueError, KeyError, TypeError, AttributeError, EOFError, MemoryError)
 """What NumPy raises for a file that is no archive of arrays, or lacks one."""
 _SAME_PART = 1e-4
 """Poses of a file that are nearer than this part of their extent to those of odometry alone are

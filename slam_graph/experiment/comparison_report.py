@@ -251,7 +251,7 @@ def _html_line(tag: str, values: tuple[str, ...]) -> str:
 
 
 def _ratio(value: float | None, unit: float | None) -> float | None:
-    return None if value is None or unit is None else value / unit
+    return None if value is None or not unit else value / unit
 
 
 def _number(value: float | None, digits: int) -> str:

@@ -33,6 +33,7 @@ from numpy.typing import NDArray
 
 from slam_graph.errors import DataError
 from slam_graph.evaluation import ape, nees_of_run, synchronize
+from slam_graph.files import Files
 from slam_graph.geometry import AlignmentMode, Trajectory
 from slam_graph.results import ResultFolder, RunResult, SavedRun
 
@@ -48,6 +49,16 @@ _DAMAGED = (
     *(BadZipFile, zlib.error, NotImplementedError),
 )
 """What is raised for files that are not JSON, or no archive of arrays."""
+
+_PATHS = ("path", "true_path")
+_TIMES = {
+    "ms_": "frame_time_s",
+    "nis_": "nis_time_s",
+    "nees_": "nees_time_s",
+    **dict.fromkeys(("step", "cost_", "columns"), "step_time_s"),
+    **dict.fromkeys(("distance_m", "translation_m", "rotation_deg", "true_path"), "time_s"),
+}
+"""The times of series, by what their names begin with."""
 
 Series = dict[str, NDArray[Any]]
 """Arrays by the names above."""
@@ -95,22 +106,50 @@ def read_result(path: Path) -> Table | None:
 
 def _is_whole(table: Table) -> bool:
     """Whether the content of a JSON file is what `write_result` wrote."""
-    steps = table.get("mean_steps")
+    steps, metrics = table.get("mean_steps", ""), table.get("metrics")
     return (
         isinstance(table.get("settings_hash"), str)
         and (steps is None or _is_number(steps))
-        and SavedRun.fault_of_metrics(table.get("metrics")) is None
+        and SavedRun.fault_of_metrics(metrics) is None
+        and "unmeasured" in table["metrics"]["extent"]
     )
 
 
 def _is_number(value: object) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool)
+    """Whether a value is a number of which a mean can be taken."""
+    known = isinstance(value, int | float) and not isinstance(value, bool)
+    return known and abs(value) <= Files.LARGEST  # type: ignore[arg-type]
 
 
 def read_series(path: Path) -> Series:
-    """The series beside the JSON file of a run."""
-    with np.load(path.with_suffix(".npz"), allow_pickle=False) as file:
-        return {name: file[name] for name in file.files}
+    """The series beside the JSON file of a run.
+
+    Raises:
+        DataError: if it is no archive of series of numbers that belong together.
+    """
+    file = path.with_suffix(".npz")
+    try:
+        with np.load(file, allow_pickle=False) as archive:
+            series = {name: archive[name] for name in archive.files}
+        for name, values in series.items():
+            _check_series(name, values, series)
+    except (*_DAMAGED, MemoryError) as error:
+        raise DataError(f"{file}: not the series of a run ({error}); run it again") from error
+    return series
+
+
+def _check_series(name: str, values: NDArray[Any], series: Series) -> None:
+    """Refuse a series that is not of numbers, or not as long as its times.
+
+    Raises:
+        ValueError: naming it.
+    """
+    shape = (len(values), 3) if name in _PATHS and values.ndim else (values.size,)
+    if values.dtype.kind not in "fiu" or values.shape != shape:
+        raise ValueError(f"'{name}' is not of numbers, or has another shape")
+    times = next((times for start, times in _TIMES.items() if name.startswith(start)), "")
+    if times in series and len(values) != len(series[times]):
+        raise ValueError(f"'{name}' is not as long as '{times}'")
 
 
 def _series_of(result: RunResult) -> Series:

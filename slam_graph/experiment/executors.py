@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 import os
-import signal
 import subprocess
 import sys
 import time
@@ -22,7 +21,7 @@ ONE_THREAD = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_
 """Environment of a task: tasks run in parallel, so BLAS uses one thread in each."""
 
 _STOP_TIMEOUT_S = 10.0
-"""Time for a task to end after SIGINT before it is killed."""
+"""Time for a task to end after SIGTERM before it is killed."""
 
 _CONNECT_TIMEOUT_S = 10.0
 
@@ -224,13 +223,14 @@ class _TaskProcess(subprocess.Popen[str]):
 
 
 def _stop(processes: Sequence[_TaskProcess]) -> None:
-    """End the processes of tasks, all at once, with SIGINT: they leave no incomplete files then.
+    """End the processes of tasks, all at once, with SIGTERM: they leave no incomplete files then.
 
-    What has not ended in time, or when there is another Ctrl-C, is killed.
+    SIGINT would be ignored by tasks of a command in the background of a shell. What has not ended
+    in time, or when there is another Ctrl-C, is killed.
     """
     for process in processes:
         with suppress(ProcessLookupError):
-            process.send_signal(signal.SIGINT)
+            process.terminate()
     deadline = time.monotonic() + _STOP_TIMEOUT_S
     try:
         for process in processes:

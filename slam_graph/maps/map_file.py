@@ -26,6 +26,7 @@ from scipy.spatial.transform import Rotation
 from slam_graph.arrays import BoolArray
 from slam_graph.datasets import kalibr_text, rig_from_kalibr
 from slam_graph.errors import DataError
+from slam_graph.files import Files
 from slam_graph.loop_closure import Vocabulary
 from slam_graph.maps.map_model import NO_FEATURE, Links, MapRecording, PoseSource, SlamMap
 from slam_graph.pose_graph import Poses
@@ -355,7 +356,7 @@ def _rows(content: SlamMap) -> Iterator[tuple[str, BoolArray, str]]:
         yield name, np.abs(values) <= largest, f"is not finite or beyond {largest:g}"
     count, offsets = len(content), content.offsets
     ends = (offsets[0] == 0) & (offsets[-1] == len(content.features))
-    rising = np.diff(offsets, prepend=offsets[0]) >= 0
+    rising = np.concatenate([[True], offsets[1:] >= offsets[:-1]])  # a difference may overflow
     yield "offsets", rising & ends, "does not lead from 0 to all observations"
     yield "features", _within(content.features, NO_FEATURE, len(content.points)), "is no feature"
     number = content.recording_of
@@ -363,6 +364,7 @@ def _rows(content: SlamMap) -> Iterator[tuple[str, BoolArray, str]]:
     yield "recording_of", np.diff(number, prepend=number[0]) >= 0, "is of an earlier recording"
     later = np.concatenate([[True], content.stamps_ns[1:] > content.stamps_ns[:-1]])
     first = np.diff(number, prepend=number[0]) > 0
+    yield "stamps_ns", Files.are_times(content.stamps_ns), "is not a time in ns"
     yield "stamps_ns", later | first, "is not later than the row before"
     yield "link_ends", _within(links.ends, 0, count), "is no keyframe"
     yield "link_ends", links.ends[:, 0] != links.ends[:, 1], "joins a keyframe with itself"

@@ -263,7 +263,7 @@ def read_table(path: Path, columns: Iterable[str], what: str) -> dict[str, Any]:
 
     Returns:
         Columns (N,) by their titles: those that end with `_ns` are int64, the others float64, NaN
-        where empty, infinite or beyond any result.
+        where empty, infinite or beyond any result. `stamp_ns` increases.
 
     Raises:
         DataError: if the file is missing, or another table.
@@ -277,15 +277,19 @@ def read_table(path: Path, columns: Iterable[str], what: str) -> dict[str, Any]:
         if any(len(row) != len(titles) for row in rows):
             raise ValueError("a row has not as many cells as there are titles")
         cells = list(zip(*rows, strict=True)) or [()] * len(titles)
-        return {
+        table = {
             title: _times_ns(column) if title.endswith("_ns") else _numbers(column)
             for title, column in zip(titles, cells, strict=True)
         }
+        stamps = table.get("stamp_ns", np.zeros(0, np.int64))
+        if np.any(stamps[1:] <= stamps[:-1]):
+            raise ValueError("its times do not increase")
     except OSError as error:
         raise DataError(f"{path}: cannot be read ({error.strerror})") from error
     except (ValueError, OverflowError, csv.Error) as error:
         reason = "it is empty" if path.stat().st_size == 0 else error
         raise DataError(f"{path}: not {what} ({reason})") from error
+    return table
 
 
 def _times_ns(cells: Iterable[str]) -> IntArray:

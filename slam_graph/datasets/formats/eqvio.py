@@ -25,6 +25,8 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from slam_graph.datasets.calibration.calibration_yaml import pose_from_matrix
+from slam_graph.datasets.calibration.euroc_calibration import lens
 from slam_graph.datasets.calibration.kalibr_calibration import read_kalibr
 from slam_graph.datasets.sequence import (
     FrameStream,
@@ -45,8 +47,9 @@ from slam_graph.datasets.streams.track_frames import (
     TrackTable,
     frames_from_tables,
 )
+from slam_graph.datasets.streams.vector_lengths import lengths_of
 from slam_graph.errors import DataError
-from slam_graph.sensors import Camera, ImuData, ImuNoise, Rig, RigCamera
+from slam_graph.sensors import CAMERA_MODELS, ImuData, ImuNoise, Rig, RigCamera
 
 HEADER = "row_type,"
 META_PREFIX, IMU_PREFIX, FEATURE_PREFIX = "meta,", "imu,", "vision_feature,"
@@ -126,7 +129,8 @@ class EqvioTracks(RecordedSequence):
         for rows in read_rows(self.path):
             table = _parse_features(rows)
             table = table[self.within(table["stamp"], start_ns, end_ns)]
-            table["pixel"] = camera.distort(table["normalized"])[0]
+            with np.errstate(all="ignore"):  # what is too far is left out later
+                table["pixel"] = camera.distort(table["normalized"])[0]
             yield table
 
 
@@ -193,12 +197,14 @@ def _read_rig(path: Path) -> Rig:
     if space != "normalized":
         raise DataError(f"{where}: measurement_space is '{space}'; only 'normalized' can be read")
     fx, fy, cx, cy = meta.numbers("camera_", "fx fy cx cy")
+    where = f"{path}: camera_fx to camera_cy"
+    camera = lens(CAMERA_MODELS["none"](), (fx, fy, cx, cy), (), _RESOLUTION, where)
     quaternion = np.array(meta.numbers("T_ci_", "qw qx qy qz"))
-    length = float(np.linalg.norm(quaternion))
+    length = float(lengths_of(quaternion[None])[0])
     if not abs(length - 1.0) < _QUATERNION_TOLERANCE:
         raise DataError(f"{path}: T_ci is not a rotation, its quaternion has length {length:.4g}")
-    body_T_camera = gtsam.Pose3(
-        gtsam.Rot3.Quaternion(*(quaternion / length)), np.array(meta.numbers("T_ci_", "tx ty tz"))
-    )
-    camera = Camera(fx, fy, cx, cy, "none", (), *_RESOLUTION)
+    matrix = np.eye(4)
+    matrix[:3, :3] = gtsam.Rot3.Quaternion(*(quaternion / length)).matrix()
+    matrix[:3, 3] = meta.numbers("T_ci_", "tx ty tz")
+    body_T_camera = pose_from_matrix(matrix, f"{path}: T_ci")
     return Rig((RigCamera(camera, body_T_camera, 0.0, "cam0"),), ImuNoise())

@@ -4,8 +4,9 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import gtsam
@@ -14,11 +15,13 @@ from numpy.typing import NDArray
 
 from slam_graph.arrays import FloatArray
 from slam_graph.datasets.calibration.calibration_yaml import pose_from_matrix
+from slam_graph.datasets.calibration.euroc_calibration import check_size, lens
 from slam_graph.datasets.streams.csv_rows import STAMP_TEXT, read_rows, stamps_from_seconds
 from slam_graph.datasets.streams.pairing import in_order
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import DataError
-from slam_graph.sensors import Camera
+from slam_graph.files import Files
+from slam_graph.sensors import CAMERA_MODELS, Camera
 
 _LARGEST = 1e6
 """Pixels, metres and focal lengths are smaller."""
@@ -93,11 +96,16 @@ def rectified_camera(
     Raises:
         DataError: if there is no such camera.
     """
+    check_size((width, height), where)
     K = projection[:, :3]
-    if min(width, height, K[0, 0], K[1, 1], K[2, 2]) <= 0 or np.any(np.tril(K, -1)):
-        raise DataError(f"{where}: not the projection of a rectified camera with a size")
-    camera = Camera(K[0, 0], K[1, 1], K[0, 2], K[1, 2], "none", (), width, height)
-    return camera, gtsam.Pose3(gtsam.Rot3(), np.linalg.solve(K, projection[:, 3]))
+    if min(K[0, 0], K[1, 1], K[2, 2]) <= 0 or np.any(np.tril(K, -1)):
+        raise DataError(f"{where}: not the projection of a rectified camera")
+    intrinsics = float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2])
+    camera = lens(CAMERA_MODELS["none"](), intrinsics, (), (width, height), where)
+    matrix = np.eye(4)
+    with np.errstate(all="ignore"):  # nearly singular: refused for what comes of it
+        matrix[:3, 3] = np.linalg.solve(K, projection[:, 3])
+    return camera, pose_from_matrix(matrix, where)
 
 
 def read_dates(path: Path) -> NDArray[np.int64]:
@@ -111,19 +119,28 @@ def read_dates(path: Path) -> NDArray[np.int64]:
     stamps: list[int] = []
     for rows in read_rows(path):
         for k, line in enumerate(rows.lines):
-            date, _, fraction = line.strip().partition(".")
-            try:
-                seconds = datetime.strptime(date, "%Y-%m-%d %H:%M:%S").replace(tzinfo=UTC)
-                nanoseconds = int(fraction[:9].ljust(9, "0"))
-                stamp_ns = int(seconds.timestamp()) * 10**9 + nanoseconds
-                np.int64(stamp_ns)  # it ends in 2262
-            except (ValueError, OverflowError):
+            stamp_ns = _nanoseconds(line.strip())
+            if stamp_ns is None:
                 text = line.strip()[:60]
-                raise DataError(f"{rows.where(k)}: '{text}' is not a date and time") from None
+                raise DataError(f"{rows.where(k)}: '{text}' is not a date and time")
             stamps.append(stamp_ns)
     if not stamps:
         raise DataError(f"{path}: no time stamps in this file")
     return np.array(stamps, np.int64)
+
+
+def _nanoseconds(text: str) -> int | None:
+    """Nanoseconds since 1970 of a date and time, in the years that stamps reach to; else None."""
+    date, _, fraction = text.partition(".")
+    try:
+        time = datetime.strptime(date, "%Y-%m-%d %H:%M:%S").replace(tzinfo=UTC)
+    except ValueError:
+        return None
+    if not re.fullmatch("[0-9]*", fraction):
+        return None
+    whole = (time - datetime(1970, 1, 1, tzinfo=UTC)) // timedelta(seconds=1)
+    stamp_ns = whole * 10**9 + int(fraction[:9].ljust(9, "0"))
+    return stamp_ns if abs(stamp_ns) < Files.LARGEST_STAMP_NS else None
 
 
 def read_seconds(path: Path) -> NDArray[np.int64]:

@@ -31,6 +31,7 @@ from slam_graph.datasets.streams.csv_rows import read_rows
 from slam_graph.datasets.streams.image_sequence import ImageSequence
 from slam_graph.datasets.streams.images import Fault, FileImages
 from slam_graph.errors import DataError
+from slam_graph.files import Files
 from slam_graph.geometry import Trajectory
 from slam_graph.sensors import Rig, RigCamera
 
@@ -119,8 +120,8 @@ def _read_poses(path: Path) -> FloatArray:
 def _are_poses(matrices: FloatArray) -> BoolArray:
     """Which matrices (N, 3, 4) are finite, with a rotation in their first three columns."""
     defects, dets = rotation_defects(matrices[:, :, :3])
-    finite = np.isfinite(matrices).all(axis=(1, 2))
-    return np.asarray(finite & (dets > 0.0) & (defects <= ROTATION_TOLERANCE), bool)
+    near = Files.are_measurable(matrices).all(axis=(1, 2))
+    return np.asarray(near & (dets > 0.0) & (defects <= ROTATION_TOLERANCE), bool)
 
 
 def _read_rig(path: Path, streams: list[FileImages]) -> Rig:

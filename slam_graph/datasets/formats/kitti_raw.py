@@ -25,6 +25,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from slam_graph.arrays import FloatArray
+from slam_graph.datasets.calibration.euroc_calibration import check_size
 from slam_graph.datasets.calibration.kalibr_calibration import read_kalibr
 from slam_graph.datasets.formats.kitti_files import (
     CalibrationFile,
@@ -45,6 +46,7 @@ from slam_graph.datasets.streams.images import Fault, FileImages, Image
 from slam_graph.datasets.streams.imu_stream import clean_blocks
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import DataError
+from slam_graph.files import Files
 from slam_graph.geometry import Trajectory
 from slam_graph.sensors import AidingData, ImuData, ImuNoise, Rig, RigCamera
 
@@ -121,7 +123,7 @@ class _Oxts:
         stamps_ns = self.stamps_ns
         values = np.array([self._read(k) for k in range(len(stamps_ns))])
         on_earth = (np.abs(values[:, POSITION]) <= LARGEST_GEODETIC).all(axis=1)
-        whole = np.flatnonzero(np.isfinite(values).all(axis=1) & on_earth)
+        whole = np.flatnonzero(Files.are_measurable(values).all(axis=1) & on_earth)
         for k in np.setdiff1d(np.arange(len(values)), whole):
             diagnostics.warn("groundtruth_not_finite", f"{self.where(int(k))}: no pose")
         timestamps = self.folder / "timestamps.txt"
@@ -178,6 +180,9 @@ GREY = ("00", "01")
 
 STEREO_TOLERANCE_S = 0.02
 """The cameras are triggered together, 10 times a second; their stamps are the computer's."""
+
+_MOST_PIXELS = 16
+"""Rectified images have at most so many times the pixels of those that were taken."""
 
 _LEAST_HZ = 0.1
 """Rate of the IMU where its samples do not show one."""
@@ -308,6 +313,11 @@ def _rectification(day: Path, camera: str, stream: FileImages) -> Callable[[Imag
     taken, rectified = (_size(calibration, f"{key}_{camera}") for key in ("S", "S_rect"))
     if first.shape[::-1] == rectified or first.shape[::-1] != taken:
         return None
+    if rectified[0] * rectified[1] > _MOST_PIXELS * taken[0] * taken[1]:
+        raise DataError(
+            f"{path}: line 'S_rect_{camera}:' makes images of {rectified[0]}x{rectified[1]} from "
+            f"ones of {taken[0]}x{taken[1]}; correct the calibration, or give --calibration"
+        )
     return rectifier(
         calibration.numbers(f"K_{camera}", 9).reshape(3, 3),
         calibration.numbers(f"D_{camera}", 5),
@@ -319,5 +329,6 @@ def _rectification(day: Path, camera: str, stream: FileImages) -> Callable[[Imag
 
 
 def _size(calibration: CalibrationFile, key: str) -> tuple[int, int]:
-    width, height = calibration.numbers(key, 2)
+    width, height = calibration.numbers(key, 2).tolist()
+    check_size((width, height), f"{calibration.path}: line '{key}:'")
     return int(width), int(height)

@@ -17,6 +17,7 @@ from slam_graph.datasets.calibration.calibration_yaml import pose_from_matrix
 from slam_graph.datasets.formats.recorded_files import AGAIN
 from slam_graph.datasets.streams.vector_lengths import lengths_of
 from slam_graph.errors import DataError
+from slam_graph.files import Files
 from slam_graph.geometry import NavState, Trajectory
 
 _Shape = tuple[int | Literal["N"], ...]
@@ -120,8 +121,9 @@ def _load(path: Path, required: tuple[str, ...], shapes: dict[str, _Shape]) -> d
                 f"{path}: '{name}' has shape {array.shape} and type {array.dtype}, expected "
                 f"{shape} and {dtype}; {AGAIN}"
             )
-        if not np.isfinite(array).all():
-            raise DataError(f"{path}: '{name}' is not finite; {AGAIN}")
+        usable = Files.are_times(array) if dtype.kind == "i" else Files.are_measurable(array)
+        if not np.all(usable):
+            raise DataError(f"{path}: '{name}' is not finite, or beyond any measurement; {AGAIN}")
     return arrays
 
 

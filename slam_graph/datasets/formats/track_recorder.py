@@ -118,7 +118,7 @@ class TrackRecorder:
 
         Raises:
             DataError: if the frame is not later, has another number of cameras than the rig, has a
-                label that is not 0 to 65535, or cannot be written.
+                feature twice in a camera or a label that is not 0 to 65535, or cannot be written.
         """
         self._check(frame)
         if aiding is not None:
@@ -143,6 +143,12 @@ class TrackRecorder:
                 f"{self.path}: a frame at {frame.stamp_ns} cannot be recorded after one at "
                 f"{self._latest_ns}"
             )
+        for seen in (*frame.cameras, *frame.moving):
+            if len(set(seen.ids.tolist())) < len(seen):
+                raise DataError(
+                    f"{self.path}: the frame at {frame.stamp_ns} cannot be recorded, as a feature "
+                    "is in it twice"
+                )
         for seen in (frame.cameras[0], *frame.moving):
             wrong = unknown_labels(seen.labels)
             if wrong.size:

@@ -275,6 +275,8 @@ class TrackRecordingSequence(RecordedSequence):
         )
         if not used:
             raise DataError(f"{self.path / name}: a feature is not finite, or too far; {AGAIN}")
+        if len(set(ids.tolist())) < len(ids):
+            raise DataError(f"{self.path / name}: a feature is in a frame twice; {AGAIN}")
         return FeatureObservations(ids, pixels, normalized)
 
     def _seen_by_lenses(

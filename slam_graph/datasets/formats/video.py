@@ -24,6 +24,7 @@ from slam_graph.datasets.formats.image_folder import (
     regular_stamps,
 )
 from slam_graph.datasets.sequence import FrameStream, ReaderOptions
+from slam_graph.datasets.streams.image_files import fault_of_claim
 from slam_graph.datasets.streams.image_sequence import (
     LOOKED_AT,
     GroupedSequence,
@@ -69,6 +70,12 @@ class _VideoReader:
             raise DataError(f"{path}: this video cannot be opened; it is damaged or not a video")
         self._next = 0
         self._most = path.stat().st_size
+        sides = (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT)
+        width, height = (int(self._capture.get(side)) for side in sides)
+        fault = fault_of_claim((width, height), self._most)
+        if fault is not None:
+            self.close()
+            raise DataError(f"{path}: this video {fault}; it is damaged")
 
     @property
     def count(self) -> int | None:

@@ -21,6 +21,7 @@ from slam_graph.datasets.streams.aiding_files import fixes_from, kept_of, known_
 from slam_graph.datasets.streams.vector_lengths import lengths_of
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import DataError
+from slam_graph.files import Files
 from slam_graph.sensors import AidingData
 
 NAV_SAT_FIX = "sensor_msgs/msg/NavSatFix"
@@ -168,7 +169,7 @@ class BagAiding:
             base = frame if base is None else base
         stamps_ns, poses = np.array(stamps, np.int64), np.array(rows).reshape(-1, 7)
         lengths = lengths_of(poses[:, 3:])
-        good = np.isfinite(poses).all(axis=1) & np.isfinite(lengths)
+        good = Files.are_measurable(poses).all(axis=1) & np.isfinite(lengths)
         good &= lengths >= _SHORTEST_QUATERNION
         what = f"{self._bag.path}: odometry"
         kept = kept_of(stamps_ns, good, "odometry_dropped", what, self._diagnostics)

@@ -126,6 +126,6 @@ def _decompressed(data: bytes, form: str, where: str) -> NDArray[Any] | Fault:
     image = decode_depth(data[_HEADER.size :], where)
     if isinstance(image, Fault) or not form.startswith("32FC1"):
         return image
-    with np.errstate(divide="ignore"):
+    with np.errstate(all="ignore"):  # a and b may be damaged
         metres = np.float32(a) / (image.astype(np.float32) - np.float32(b))
     return np.where(image == 0, np.float32(np.nan), metres)

@@ -59,7 +59,7 @@ _VERTICAL = 2.0
 LARGEST_GEODETIC = np.array([90.0, 360.0, 1e6])
 """Latitudes and longitudes (degrees) and heights (m) are no larger."""
 _FARTHEST_M, _LEAST_SIGMA = 1e6, 1e-9
-"""Bounds on known poses: coordinates, and standard deviations in m and rad."""
+"""Bounds on known poses: coordinates, and standard deviations in m and rad; these of fixes too."""
 
 
 def read_aiding(
@@ -163,8 +163,8 @@ def fixes_from(
     """
     local, datum = frame
     whole = np.column_stack([positions, covariances.reshape(-1, 9)])
-    good = np.isfinite(whole).all(axis=1)
-    good &= (np.diagonal(covariances, axis1=1, axis2=2) > 0).all(axis=1)
+    good = Files.are_measurable(whole).all(axis=1)
+    good &= (np.diagonal(covariances, axis1=1, axis2=2) >= _LEAST_SIGMA**2).all(axis=1)
     if not local:
         good &= (np.abs(positions) <= LARGEST_GEODETIC).all(axis=1)
     good = np.asarray(good, np.bool_)
@@ -188,6 +188,7 @@ def kept_of(
         what: they are and where, for messages.
         diagnostics: counts them.
     """
+    good = good & Files.are_times(stamps_ns)
     for stamp_ns in stamps_ns[~good].tolist():
         diagnostics.warn(kind, f"{what} at {stamp_ns} dropped, it has no values that can be used")
     whole = np.flatnonzero(good)
@@ -270,7 +271,7 @@ def _read_odometry(path: Path, diagnostics: Diagnostics) -> tuple[IntArray, Floa
         raise DataError(f"{path}: no odometry in this file")
     table = np.concatenate(tables)
     stamps, lengths = table["stamp"], lengths_of(table["quaternion"])
-    good = np.isfinite(table["position"]).all(axis=1) & (np.abs(lengths - 1.0) < 1e-2)
+    good = Files.are_measurable(table["position"]).all(axis=1) & (np.abs(lengths - 1.0) < 1e-2)
     table = table[kept_of(stamps, good, "odometry_dropped", f"{path}: odometry", diagnostics)]
     return table["stamp"], table["position"], table["quaternion"]
 

@@ -39,6 +39,12 @@ _REACH = 0.7
 and some more, as points on a slanted surface are farther apart."""
 _MOST_PIXELS = 2e8
 """Most pixels of the camera that an image of the depth sensor is spread over, one by one."""
+_LARGEST_RATIO = 32.0
+"""Largest focal length of the camera over that of the depth sensor: each point fills as many pixels
+squared, one after the other."""
+_LARGEST_CAMERA = 2**25
+"""Most pixels of a camera that depth is registered to; its images may be missing, so that nothing
+else tells that its calibrated size is wrong."""
 
 
 class DepthStream(Protocol):
@@ -149,9 +155,17 @@ class Registration:
         lens: intrinsics of the depth camera.
         camera: that the depth is registered to.
         camera_T_depth: pose of the depth camera in the frame of the camera.
+
+    Raises:
+        DataError: if the calibration would take memory or time out of proportion.
     """
 
     def __init__(self, lens: Camera, camera: Camera, camera_T_depth: gtsam.Pose3) -> None:
+        if camera.width * camera.height > _LARGEST_CAMERA:
+            raise DataError(
+                f"calibration of the depth sensor: its camera has {camera.width}x{camera.height} "
+                "pixels, too many to register depth to; correct the resolution"
+            )
         u, v = np.meshgrid(np.arange(lens.width), np.arange(lens.height))
         pixels = np.column_stack([u.ravel(), v.ravel()]).astype(np.float64)
         plane, visible = lens.visible(pixels)
@@ -161,7 +175,7 @@ class Registration:
         self._origin = np.asarray(camera_T_depth.translation())
         self._camera = camera
         ratio = max(camera.fx / lens.fx, camera.fy / lens.fy, 1.0)
-        if ratio**2 * lens.width * lens.height > _MOST_PIXELS:
+        if ratio > _LARGEST_RATIO or ratio**2 * lens.width * lens.height > _MOST_PIXELS:
             raise DataError(
                 f"calibration of the depth sensor: its focal length is {ratio:.0f} times shorter "
                 "than that of its camera; correct its intrinsics"

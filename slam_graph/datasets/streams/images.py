@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam_graph.arrays import IntArray
+from slam_graph.datasets.streams.image_files import JPEG_SIGNATURE, PNG_SIGNATURE, decode_image
 from slam_graph.errors import DataError
 
 T = TypeVar("T")
@@ -27,8 +28,7 @@ _LONGEST_NAME = 250
 Image = NDArray[np.uint8]
 """(height, width), grey."""
 
-_PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
-JPEG_SIGNATURE, JPEG_END = b"\xff\xd8", b"\xff\xd9"
+JPEG_END = b"\xff\xd9"
 
 _FRAMES_AHEAD = 3
 """Frames decoded ahead: enough to hide the time of decoding, few enough to save memory."""
@@ -126,20 +126,14 @@ def decoded(data: bytes, flags: int) -> NDArray[Any] | str:
         flags: OpenCV's, of `cv2.imdecode`.
     """
     damage = find_damage(data)
-    if damage is not None:
-        return damage
-    try:
-        image: NDArray[Any] | None = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
-    except cv2.error as error:
-        return str(error.err)
-    return "not an image that OpenCV can read" if image is None else image
+    return decode_image(data, flags) if damage is None else damage
 
 
 def find_damage(data: bytes) -> str | None:
     """What is wrong with the bytes of an image file, as far as is known without decoding it."""
     if not data:
         return "empty file"
-    if data.startswith(_PNG_SIGNATURE):
+    if data.startswith(PNG_SIGNATURE):
         return _find_png_damage(data)
     if data.startswith(JPEG_SIGNATURE) and JPEG_END not in data[-1024:]:
         return "truncated JPEG"
@@ -149,7 +143,7 @@ def find_damage(data: bytes) -> str | None:
 def _find_png_damage(data: bytes) -> str | None:
     """Compare the checksums of the chunks of a PNG file (0.1 ms for EuRoC's)."""
     view = memoryview(data)
-    position = len(_PNG_SIGNATURE)
+    position = len(PNG_SIGNATURE)
     while position + 12 <= len(data):
         end = position + 12 + int.from_bytes(view[position : position + 4], "big")
         if end > len(data):

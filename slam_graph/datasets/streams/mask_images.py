@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam_graph.arrays import FloatArray, IntArray
-from slam_graph.datasets.streams.csv_rows import read_rows
+from slam_graph.datasets.streams.csv_rows import check_times, read_rows
 from slam_graph.datasets.streams.images import decoded
 from slam_graph.errors import DataError
 from slam_graph.files import Files
@@ -139,7 +139,10 @@ def _read_image(path: Path, size: tuple[int, int]) -> LabelImage:
 
 
 def _read_boxes(path: Path) -> NDArray[np.void]:
-    blocks = [rows.parse(_BOX, "stamp, label and box") for rows in read_rows(path)]
+    blocks = []
+    for rows in read_rows(path):
+        blocks.append(rows.parse(_BOX, "stamp, label and box"))
+        check_times(rows, blocks[-1]["stamp"])
     table = np.concatenate(blocks) if blocks else np.zeros(0, np.dtype(_BOX))
     box, label = table["box"], table["label"]
     if not np.isfinite(box).all() or np.any((label < 1) | (label > LARGEST_LABEL)):
@@ -170,7 +173,8 @@ def read_classes(folder: Path) -> dict[int, str]:
         label, _, name = line.partition(",")
         if not line.strip() or line.startswith("#"):
             continue
-        if not re.fullmatch(r"[0-9]{1,5}", label.strip()) or not name.strip():
+        known = re.fullmatch(r"[0-9]{1,5}", label.strip()) and int(label) <= LARGEST_LABEL
+        if not known or not name.strip():
             raise DataError(f"{path}:{number}: expected a label and a name, got '{line[:40]}'")
         classes[int(label)] = " ".join(name.split())
     return classes
