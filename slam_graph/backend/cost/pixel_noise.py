@@ -49,8 +49,8 @@ _QUANTILE = 0.95
 """Of the distribution of a track's sum, where the sum is cut off."""
 _MAX_RATIO = 4.0
 """Largest ratio of the estimate to the setting, and of the setting to the estimate."""
-_DRIFT_SHARE = 2
-"""One track of so many is asked how far it slides off its point: it takes time."""
+_DRIFT_STEPS = 2
+"""One step of so many asks how far tracks slide off their points: it takes time."""
 _CLEARLY_LARGER = 1.25
 """Ratio of the estimate to the setting from which `larger` takes the estimate."""
 
@@ -115,15 +115,14 @@ class PixelNoise:
             self._learn_drift(cost, tracks, stamp_ns)
 
     def _learn_drift(self, cost: Cost, tracks: TrackFeatures | None, stamp_ns: int) -> None:
-        """Learn from a share of the tracks that passed the gate, a different one in each step.
+        """Learn from the tracks that passed the gate, in one step of several.
 
         Features of the state pass it in every frame: what it rejects says nothing of them.
         """
-        if tracks is None or cost.tracks is None:
-            return
         self._steps += 1
-        asked = is_in(tracks.obs.ids, cost.tracks.obs.ids)
-        known = tracks.subset(asked & ((tracks.obs.ids + self._steps) % _DRIFT_SHARE == 0))
+        if tracks is None or cost.tracks is None or self._steps % _DRIFT_STEPS:
+            return
+        known = tracks.subset(is_in(tracks.obs.ids, cost.tracks.obs.ids))
         if len(known.obs):
             residuals, by_point = _linearized(cost, known)
             self.drift.learn(known.obs, residuals, by_point, len(self.sigma_px), stamp_ns)

@@ -35,7 +35,7 @@ from slam_graph.backend.solve.state import POINT_DIM, features_of
 from slam_graph.backend.window import Window
 from slam_graph.kernels.feature_sums import block_sums
 
-EVERY_FRAMES = 4
+EVERY_FRAMES = 6
 """Features slide once in so many frames, for as many frames: it takes time."""
 _BLOCKS = (1, 8)
 """Consecutive observations of a camera that are averaged."""
@@ -45,7 +45,7 @@ _LEAST_DOF = 30.0
 """Degrees of freedom of block means from which on they count for more than the settings."""
 _QUANTILE = 0.999
 """Of the distribution of a track's sum, where the sum is cut off."""
-_DEVIATIONS = 1.0
+_DEVIATIONS = 1.5
 """Standard deviations of the block means that are not taken for drift."""
 
 
@@ -152,10 +152,12 @@ def slide_features(window: Window, rig: RigProjection, sigma_px: float) -> None:
     obs, rig = obs.rows(obs.starts[:-1]), rig.at(window.state)  # where the first camera sees them
     poses = rig.when_taken(obs.frames, *window.state.poses(obs.frames))
     at = Geometry(*poses, window.state.positions_of(ids))
-    moves = np.linalg.pinv(rig.derivatives(obs, at, rig.views(obs, at))[1])
+    J = rig.derivatives(obs, at, rig.views(obs, at))[1]
+    # J⁺ J⁺ᵀ = Jᵀ (J Jᵀ)⁻² J
+    root = np.linalg.solve(J @ J.transpose(0, 2, 1), J)
     known = features_of(window.prior.layout)  # its first columns
     order = np.argsort(known)
     noise = np.zeros((len(known), POINT_DIM, POINT_DIM))
     sliding = order[np.searchsorted(known, ids, sorter=order)]
-    noise[sliding] = EVERY_FRAMES * sigma_px**2 * moves @ moves.transpose(0, 2, 1)
+    noise[sliding] = EVERY_FRAMES * sigma_px**2 * root.transpose(0, 2, 1) @ root
     window.prior = window.prior.with_noise(noise)
