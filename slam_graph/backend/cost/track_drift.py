@@ -24,6 +24,8 @@ White noise falls with n, a walk does not: n = 1 and n = 8 give two equations fo
 
 from __future__ import annotations
 
+import contextlib
+
 import numpy as np
 from scipy.special import gammainc, gammaincinv
 
@@ -52,13 +54,14 @@ _DEVIATIONS = 1.5
 class TrackDrift:
     """How far tracks slide off their points in a frame.
 
+    Until they show it, it is what the settings say.
+
     Attributes:
         sigma_px: standard deviation along each axis of the image after one frame; √n times that
             after n.
     """
 
     def __init__(self, config: NoiseConfig) -> None:
-        self._adaptive = config.adaptive_drift
         self.sigma_px = config.drift_px
         self._variances = np.array([config.pixel_sigma, config.drift_px]) ** 2
         self._traces, self._squares, self._dof = np.zeros((2, 2)), np.zeros(2), np.zeros(2)
@@ -76,8 +79,6 @@ class TrackDrift:
             cameras: their number.
             stamp_ns: time of the step.
         """
-        if not self._adaptive:
-            return
         if self._stamp_ns is not None:
             memory = np.exp(-(stamp_ns - self._stamp_ns) * 1e-9 / _MEMORY_S)
             self._traces, self._squares = memory * self._traces, memory * self._squares
@@ -100,7 +101,8 @@ class TrackDrift:
         Args:
             k: which block.
             squares: (J,) squared block means.
-            white, white2: (J,) tr(S) and tr(S²).
+            white: (J,) tr(S).
+            white2: (J,) tr(S²).
             walk: (J,) tr(D).
         """
         noise, drift = self._variances
@@ -126,11 +128,9 @@ class TrackDrift:
 
 def _nonnegative(traces: FloatArray, squares: FloatArray) -> FloatArray:
     """Variances (2,) of white noise and walk, neither below zero; the noise stays above it."""
+    white = squares[0] / traces[0, 0]
     noise, drift = np.linalg.solve(traces, squares)
-    if drift < 0.0:
-        return np.array([squares[0] / traces[0, 0], 0.0])
-    least = 1e-3 * squares[0] / traces[0, 0]
-    return np.array([max(noise, least), drift])
+    return np.array([max(noise, 1e-3 * white), drift]) if drift > 0.0 else np.array([white, 0.0])
 
 
 def slide_features(window: Window, rig: RigProjection, sigma_px: float) -> None:
@@ -160,4 +160,5 @@ def slide_features(window: Window, rig: RigProjection, sigma_px: float) -> None:
     noise = np.zeros((len(known), POINT_DIM, POINT_DIM))
     sliding = order[np.searchsorted(known, ids, sorter=order)]
     noise[sliding] = EVERY_FRAMES * sigma_px**2 * root.transpose(0, 2, 1) @ root
-    window.prior = window.prior.with_noise(noise)
+    with contextlib.suppress(np.linalg.LinAlgError):  # not determined: the steps will say so
+        window.prior = window.prior.with_noise(noise)
