@@ -65,6 +65,22 @@ def test_a_tall_update_equals_the_same_rows_in_pieces() -> None:
     assert np.all(np.tril(whole.Rd, -1) == 0.0)
 
 
+@pytest.mark.parametrize("count", [0, 1, 3])
+def test_noise_of_the_leading_variables_adds_to_their_covariance(count: int) -> None:
+    rng, dims = np.random.default_rng(count), {1: 3, 2: 3, 3: 3, 4: 6, 5: 1}
+    size = sum(dims.values())
+    before = SquareRootInformation(Layout(dims), triangularize(random_rows(rng, 40, size)))
+    roots = rng.normal(size=(count, 3, 2))  # of rank two
+    after = before.with_noise(roots @ roots.transpose(0, 2, 1))
+    expected = before.covariance()
+    for k, root in enumerate(roots):
+        expected[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] += root @ root.T
+    np.testing.assert_allclose(after.covariance(), expected, atol=1e-12)
+    np.testing.assert_allclose(after.solution(), before.solution(), atol=1e-12)
+    assert after.residual == before.residual
+    assert np.all(np.tril(after.Rd, -1) == 0.0)
+
+
 @pytest.mark.parametrize("first", [0, 2])
 def test_zeros_that_are_left_out_change_nothing(first: int) -> None:
     """Staggered rows say the same in reverse order, in which none of their zeros is left out."""

@@ -235,10 +235,12 @@ def test_eliminate_columns(gone: list[int]) -> None:
 
 
 def test_block_sums() -> None:
-    r, _, by_point, _, camera, starts = tracks(np.random.default_rng(7), 0)
-    found = np.empty((2, 3, len(starts) - 1, 2))
-    block_sums(r, by_point, camera % 2, starts, 3, found[0])
-    block_sums_numpy(r, by_point, camera % 2, starts, 3, found[1])
+    rng = np.random.default_rng(7)
+    r, _, by_point, _, camera, starts = tracks(rng, 0)
+    frame = np.cumsum(rng.integers(0, 3, len(r)))  # two cameras see a frame, and some are left out
+    found = np.empty((2, 4, len(starts) - 1, 2))
+    block_sums(r, by_point, camera % 2, frame, starts, 3, found[0])
+    block_sums_numpy(r, by_point, camera % 2, frame, starts, 3, found[1])
     assert same(*found)
     assert np.any(found[0] == 0.0)
 

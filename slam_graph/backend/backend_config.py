@@ -52,6 +52,12 @@ class NoiseConfig(Settings):
     take it where it is clearly larger than `pixel_sigma`, up to four times that. any: also where
     it is smaller, down to a quarter; covariances are then more often too small. never: take
     `pixel_sigma`, as GTSAM's smoothers always do."""
+    drift_px: float = expert(0.0, ge=0)
+    """How far tracks slide off their points in one frame, in pixels along each axis: √n times as
+    far in n frames. It is process noise of the features in the state."""
+    adaptive_drift: bool = expert(default=True)
+    """Estimate `drift_px` from the residuals of tracks; the setting is then what holds until they
+    show it. GTSAM's smoothers take no drift."""
     gravity: float = expert(9.81, gt=0)
     """Magnitude of gravity where it was recorded, in m/s² (9.78 at the equator, 9.83 at the
     poles)."""

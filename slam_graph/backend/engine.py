@@ -12,6 +12,7 @@ import numpy as np
 from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.backend.cost.construction import ConstructedCost, CostConstruction
 from slam_graph.backend.cost.cost import Cost
+from slam_graph.backend.cost.track_drift import slide_features
 from slam_graph.backend.engine_protocol import EngineContext, StepReport
 from slam_graph.backend.marginalization.marginalize import marginalize_step
 from slam_graph.backend.solve.gauss_newton import Minimum, minimize
@@ -50,6 +51,7 @@ class SquareRootEngine:
             context.add_observations(window, frame)
         with report.timed("cost"):
             if not still:
+                slide_features(window, context.projection, context.pixels.drift.sigma_px)
                 window.recall_features()
             constructed = self._construction.construct(window, still)
         with report.timed("gauss_newton"):

@@ -206,11 +206,12 @@ def extents_numpy(
         diagonals[j, c] = np.linalg.norm(np.ptp(seen, axis=0)) if len(seen) else 0.0
 
 
-@compiled("void(f8[:, ::1], f8[:, :, ::1], i8[:], i8[::1], i8, f8[:, :, ::1])")
+@compiled("void(f8[:, ::1], f8[:, :, ::1], i8[:], i8[:], i8[::1], i8, f8[:, :, ::1])")
 def block_sums(
     r: FloatArray,
     by_point: FloatArray,
     camera: IntArray,
+    frame: IntArray,
     starts: IntArray,
     block: int,
     sums: FloatArray,
@@ -218,23 +219,27 @@ def block_sums(
     """How large the means of residuals are over blocks of consecutive observations of a camera.
 
     With the whitened residuals e = P ε of a track, P = I - Q Qᵀ the projection off the directions
-    H_f = Q R_f of its point, the rows B that average over its blocks in one camera, and
-    S = B P Bᵀ.
+    H_f = Q R_f of its point, and the rows B that average over its blocks in one camera,
+    S = B P Bᵀ for white noise, and D = B P K P Bᵀ for a random walk from frame to frame that all
+    cameras share, K = min(i, j) for observations in frames i and j.
 
     Args:
         r: (N, 2) residuals of the observations, those of one feature after the other.
         by_point: (N, 2, 3) their derivatives by the position of the feature.
         camera: (N,) camera of each observation.
+        frame: (N,) number of the frame of each observation, which ascends in each feature.
         starts: (J + 1,) first observation of each feature, and N.
         block: observations in a block; those that fill none are left out.
-        sums: (3, J, C), filled: ‖B e‖², tr(S) and tr(S²) of each feature in each camera; NaN where
-            the observations of a feature do not determine its position.
+        sums: (4, J, C), filled: ‖B e‖², tr(S), tr(S²) and tr(D) of each feature in each camera; NaN
+            where the observations of a feature do not determine its position.
     """
     longest = 0
     for j in range(len(starts) - 1):
         longest = max(longest, starts[j + 1] - starts[j])
     Q, R, e = np.empty((2 * longest, 3)), np.empty((3, 3)), np.empty(2 * longest)
-    along, gram, mean = np.empty(3), np.empty((3, 3)), np.empty((2, 4))
+    along, gram, means = np.empty(3), np.empty((3, 3)), np.zeros((longest // block + 1, 2, 4))
+    member, later = np.empty(longest, np.int64), np.empty(longest // block + 1)
+    behind = np.empty((2, 3))
     for j in range(len(starts) - 1):
         begin, count = starts[j], starts[j + 1] - starts[j]
         for row in range(2 * count):
@@ -251,10 +256,13 @@ def block_sums(
                 e[row] -= Q[row, k] * along[k]
         for c in range(sums.shape[2]):
             blocks, filled, square = 0, 0, 0.0
-            mean[:], gram[:] = 0.0, 0.0  # gram is (B Q)ᵀ B Q
+            means[0], gram[:] = 0.0, 0.0  # gram is (B Q)ᵀ B Q
             for n in range(count):
+                member[n] = -1
                 if camera[begin + n] != c:
                     continue
+                member[n] = blocks
+                mean = means[blocks]
                 for i in range(2):
                     mean[i, 3] += e[2 * n + i] / block
                     for k in range(3):
@@ -266,7 +274,8 @@ def block_sums(
                         for k in range(3):
                             for m in range(3):
                                 gram[k, m] += mean[i, k] * mean[i, m]
-                    mean[:], filled, blocks = 0.0, 0, blocks + 1
+                    filled, blocks = 0, blocks + 1
+                    means[blocks] = 0.0
             # S = I / block - B Q (B Q)ᵀ, with two rows for each block
             trace, squares = gram[0, 0] + gram[1, 1] + gram[2, 2], 0.0
             for k in range(3):
@@ -275,12 +284,32 @@ def block_sums(
             sums[0, j, c] = square
             sums[1, j, c] = 2.0 * blocks / block - trace
             sums[2, j, c] = (2.0 * blocks / block - 2.0 * trace) / block + squares
+            # D: a step of the walk moves all later observations
+            walked, later[:], behind[:] = 0.0, 0.0, 0.0
+            for n in range(count - 1, 0, -1):
+                for i in range(2):
+                    for k in range(3):
+                        behind[i, k] += Q[2 * n + i, k]
+                if 0 <= member[n] < blocks:
+                    later[member[n]] += 1.0 / block
+                elapsed = frame[begin + n] - frame[begin + n - 1]
+                if elapsed == 0:
+                    continue
+                for b in range(blocks):
+                    for axis in range(2):
+                        for i in range(2):
+                            moved = later[b] if i == axis else 0.0
+                            for k in range(3):
+                                moved -= means[b, i, k] * behind[axis, k]
+                            walked += elapsed * moved * moved
+            sums[3, j, c] = walked
 
 
 def block_sums_numpy(
     r: FloatArray,
     by_point: FloatArray,
     camera: IntArray,
+    frame: IntArray,
     starts: IntArray,
     block: int,
     sums: FloatArray,
@@ -290,12 +319,13 @@ def block_sums_numpy(
         rows = slice(starts[j], starts[j + 1])
         Q, _ = _orthonormalize_numpy(by_point[rows].reshape(-1, 3))
         P = np.eye(len(Q)) - Q @ Q.T
+        K = np.kron(np.minimum.outer(frame[rows], frame[rows]) - frame[starts[j]], np.eye(2))
         for c in range(sums.shape[2]):
             seen = np.flatnonzero(camera[rows] == c)
             seen = seen[: len(seen) // block * block]
             averages = np.zeros((len(seen) // block, len(camera[rows])))
             averages[np.arange(len(seen)) // block, seen] = 1.0 / block
             B = np.kron(averages, np.eye(2))
-            S = B @ P @ B.T
+            S, D = B @ P @ B.T, B @ P @ K @ P @ B.T
             means = B @ P @ r[rows].ravel()
-            sums[:, j, c] = means @ means, np.trace(S), np.sum(S**2)
+            sums[:, j, c] = means @ means, np.trace(S), np.sum(S**2), np.trace(D)

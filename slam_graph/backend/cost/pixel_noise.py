@@ -30,8 +30,9 @@ from scipy.special import gammainc, gammaincinv
 from slam_graph.arrays import FloatArray
 from slam_graph.backend.backend_config import NoiseConfig
 from slam_graph.backend.cost.cost import Cost, TrackFeatures
-from slam_graph.backend.cost.feature_tracks import Observations
+from slam_graph.backend.cost.feature_tracks import Observations, is_in
 from slam_graph.backend.cost.reprojection import Geometry
+from slam_graph.backend.cost.track_drift import TrackDrift
 from slam_graph.kernels.feature_sums import block_sums, extents
 
 BLOCK = 8
@@ -48,6 +49,8 @@ _QUANTILE = 0.95
 """Of the distribution of a track's sum, where the sum is cut off."""
 _MAX_RATIO = 4.0
 """Largest ratio of the estimate to the setting, and of the setting to the estimate."""
+_DRIFT_STEPS = 2
+"""One step of so many asks how far tracks slide off their points: it takes time."""
 _CLEARLY_LARGER = 1.25
 """Ratio of the estimate to the setting from which `larger` takes the estimate."""
 
@@ -78,14 +81,17 @@ class PixelNoise:
     Attributes:
         sigma_px: (C,) that the cost takes; that of the settings at the start.
         estimate_px: (C,) that the tracks show.
+        drift: how far tracks slide off their points.
     """
 
     def __init__(self, config: NoiseConfig, cameras: int) -> None:
         self._config = config
+        self.drift = TrackDrift(config)
         self.sigma_px = self.estimate_px = np.full(cameras, config.pixel_sigma)
         self._dof = np.full(cameras, _PRIOR_DOF)
         self._squares = self._dof * self.sigma_px**2
         self._stamp_ns: int | None = None
+        self._steps = 0
 
     def assume(self, sigma_px: float) -> None:
         """Take observations for so noisy from now on."""
@@ -100,22 +106,42 @@ class PixelNoise:
                 noise that is larger than assumed would not be seen.
             stamp_ns: time of the step.
         """
+        if tracks is not None:
+            telling = tracks.obs.counts >= _MIN_OBSERVATIONS
+            telling &= _extents_px(tracks.obs, len(self.sigma_px)) >= _LEAST_MOTION_PX
+            tracks = tracks.subset(telling)
+        self._learn_noise(cost, tracks, stamp_ns)
+        if self._config.adaptive_drift:
+            self._learn_drift(cost, tracks, stamp_ns)
+
+    def _learn_drift(self, cost: Cost, tracks: TrackFeatures | None, stamp_ns: int) -> None:
+        """Learn from the tracks that passed the gate, in one step of several.
+
+        Features of the state pass it in every frame: what it rejects says nothing of them.
+        """
+        self._steps += 1
+        if tracks is None or cost.tracks is None or self._steps % _DRIFT_STEPS:
+            return
+        known = tracks.subset(is_in(tracks.obs.ids, cost.tracks.obs.ids))
+        if len(known.obs):
+            residuals, by_point = _linearized(cost, known)
+            self.drift.learn(known.obs, residuals, by_point, len(self.sigma_px), stamp_ns)
+
+    def _learn_noise(self, cost: Cost, tracks: TrackFeatures | None, stamp_ns: int) -> None:
+        """Learn how noisy each camera is."""
         if self._config.adaptive_pixels == "never":
             return
         if self._stamp_ns is not None:
             memory = np.exp(-(stamp_ns - self._stamp_ns) * 1e-9 / _MEMORY_S)
             self._dof, self._squares = memory * self._dof, memory * self._squares
         self._stamp_ns = stamp_ns
-        if tracks is None:
+        if tracks is None or len(tracks.obs) == 0:
             return
-        telling = tracks.obs.counts >= _MIN_OBSERVATIONS
-        telling &= _extents_px(tracks.obs, len(self.sigma_px)) >= _LEAST_MOTION_PX
-        known = tracks.subset(telling)
-        if len(known.obs) == 0:
-            return
-        parts = _whitened(cost, known, self.sigma_px)
+        residuals, by_point = _linearized(cost, tracks)
+        sigma = self.sigma_px[tracks.obs.camera]
+        parts = residuals / sigma[:, None], by_point / sigma[:, None, None]
         try:
-            found = block_means(known.obs, *parts, len(self.sigma_px))
+            found = block_means(tracks.obs, *parts, len(self.sigma_px))
         except np.linalg.LinAlgError:  # a point that its observations do not determine
             return
         for camera, means in enumerate(found):
@@ -140,16 +166,12 @@ def _extents_px(obs: Observations, cameras: int) -> FloatArray:
     return np.asarray(diagonals.max(axis=1))
 
 
-def _whitened(
-    cost: Cost, tracks: TrackFeatures, sigma_px: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Residuals (N, 2) and derivatives by the points (N, 2, 3), in standard deviations."""
+def _linearized(cost: Cost, tracks: TrackFeatures) -> tuple[FloatArray, FloatArray]:
+    """Residuals (N, 2) and derivatives by the points (N, 2, 3), in pixels."""
     obs, rig = tracks.obs, cost.rig.at(cost.state)
     at = Geometry(*rig.when_taken(obs.frames, *cost.state.poses(obs.frames)), tracks.points)
-    sigma = sigma_px[obs.camera]
     views = rig.views(obs, at)
-    by_point = rig.derivatives(obs, at, views)[1]
-    return (obs.pixels - views.pixels) / sigma[:, None], by_point / sigma[:, None, None]
+    return obs.pixels - views.pixels, rig.derivatives(obs, at, views)[1]
 
 
 def block_means(
@@ -168,12 +190,12 @@ def block_means(
     Raises:
         numpy.linalg.LinAlgError: if observations do not determine their point.
     """
-    sums = np.empty((3, len(obs.ids), cameras))
-    block_sums(residuals, by_point, obs.camera, obs.starts, BLOCK, sums)
+    sums = np.empty((4, len(obs.ids), cameras))
+    block_sums(residuals, by_point, obs.camera, obs.frame, obs.starts, BLOCK, sums)
     if not np.all(np.isfinite(sums)):
         raise np.linalg.LinAlgError("a point is not determined by its observations")
     means = []
-    for squares, trace, square in sums.transpose(2, 0, 1):
+    for squares, trace, square, _ in sums.transpose(2, 0, 1):
         some = trace > 0.0
         dof = trace[some] ** 2 / square[some]
         means.append(BlockMeans(squares[some] / trace[some], dof))

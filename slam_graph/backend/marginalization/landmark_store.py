@@ -101,13 +101,17 @@ class LandmarkStore:
     def due(self, seen: IntArray) -> IntArray:
         """Which features must become variables again: of those seen; none once the store closes."""
         if self._exchanges > _MAX_EXCHANGES:
-            self.open = False
-            self._conditionals.clear()
-            self._places.clear()
-            self._moved.clear()
+            self.close()
         if not self._places:
             return np.zeros(0, np.int64)
         return np.array([j for j in seen.tolist() if j in self._places], dtype=np.int64)
+
+    def close(self) -> None:
+        """Marginalise all stored features for good, and take no more."""
+        self.open = False
+        self._conditionals.clear()
+        self._places.clear()
+        self._moved.clear()
 
     def recall(
         self, features: IntArray, prior: SquareRootInformation, state: State

@@ -234,7 +234,7 @@ def object_settings(backend: BackendConfig, config: ObjectsConfig) -> BackendCon
     }
     default = BackendConfig()
     # few features, close together, do not show their noise; that of the platform's is given
-    noise = {"adaptive_pixels": "never"}
+    noise = {"adaptive_pixels": "never", "adaptive_drift": False}
     # given here, or the default without an IMU, Cauchy, would be taken
     loss = {"robust_loss": backend.gating.loss}
     return backend.model_copy(

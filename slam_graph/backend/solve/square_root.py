@@ -211,6 +211,39 @@ class SquareRootInformation:
         Rd[first:, first:] = triangle
         return SquareRootInformation(self.layout, Rd)
 
+    def with_noise(self, noise: FloatArray) -> SquareRootInformation:
+        """The Gaussian after independent noise was added to its leading variables, x₁' = x₁ + w.
+
+        The rows [R₁₁ R₁₂ d₁] are the conditional of x₁ given all others, x₂. The noise adds to its
+        covariance and changes neither its mean, as a function of x₂, nor the marginal over x₂. So
+        they become U⁻¹ R₁₁⁻¹ [R₁₁ R₁₂ d₁] with U Uᵀ = R₁₁⁻¹ R₁₁⁻ᵀ + Q, and the other rows stay:
+        the cost is that of the leading block alone.
+
+        Args:
+            noise: (J, b, b) covariances Q of the noise of J variables of b columns, the first ones.
+
+        Raises:
+            numpy.linalg.LinAlgError: if the leading variables are not determined given the others.
+        """
+        count, b = noise.shape[:2]
+        w = count * b
+        if w == 0:
+            return self
+        inverse = np.asfortranarray(np.tril(_transposed_inverse(self.R[:w, :w])))  # R₁₁⁻ᵀ
+        covariance = blas.dsyrk(1.0, inverse, trans=1, lower=1)
+        blocks = np.arange(w).reshape(count, b)
+        covariance[blocks[:, :, None], blocks[:, None, :]] += noise
+        # Cholesky's factor from the last column on, Uᵀ
+        root, info = lapack.dpotrf(np.asfortranarray(covariance[::-1, ::-1]), clean=1)
+        if info != 0:
+            raise np.linalg.LinAlgError("the leading variables are not determined")
+        root, _ = lapack.dtrtri(np.asfortranarray(root[::-1, ::-1]), lower=1)  # U⁻ᵀ
+        Rd = self.Rd.copy(order="F")
+        Rd[:w, :w] = root.T
+        turned = blas.dtrmm(1.0, inverse, root, lower=1)  # (U⁻¹ R₁₁⁻¹)ᵀ
+        Rd[:w, w:] = blas.dtrmm(1.0, turned, self.Rd[:w, w:], lower=1, trans_a=1)
+        return SquareRootInformation(self.layout, Rd)
+
     def solution(self) -> FloatArray:
         """The δ (n,) of least cost.
 
