@@ -43,14 +43,12 @@ from slam_graph.errors import EstimationError
 from slam_graph.geometry import NavState
 from slam_graph.sensors import FeatureFrame, ImuBuffer, ImuData, Rig
 
-_IMU_HISTORY_NS = 10_000_000_000
-"""How long IMU samples are kept."""
+_HISTORY_NS, _MAX_AHEAD_NS = 10_000_000_000, 10_000_000_000
+"""How long IMU samples are kept; how much later than the last one no frame is with a right stamp."""
 _LEAD_NS = 1_000_000_000
 """A given state may be this much older than the first frame after a new beginning."""
 _ROUNDS, _REPEATED_S = 3, 1e-3
 """Most beginnings with a corrected time offset; another is made if its estimate moved by more."""
-_MAX_AHEAD_NS = 10_000_000_000
-"""A frame that is later than the last IMU sample by more than this has a wrong stamp."""
 
 
 class Estimator(EstimatorKnowledge):
@@ -262,7 +260,7 @@ class Estimator(EstimatorKnowledge):
             self.diagnostics.warn("frame_out_of_order", message)
             return None
         self._latest_ns = stamp_ns
-        imu.forget_before(stamp_ns - _IMU_HISTORY_NS)
+        imu.forget_before(stamp_ns - _HISTORY_NS)
         frame = with_depth_observed(frame, self._real_rig)
         frame, bad = frame.usable(len(self.rig.cameras))
         if bad:
