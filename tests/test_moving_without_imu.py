@@ -13,6 +13,7 @@ import pytest
 from slam_graph import run
 from slam_graph.evaluation import ape
 from slam_graph.results import RunResult
+from slam_graph.sensors import FeatureFrame, FeatureObservations
 from slam_graph.sensors.perspective import camera_pose
 from slam_graph.simulation import simulate
 
@@ -59,6 +60,22 @@ def test_objects_before_a_depth_camera(with_imu: bool) -> None:
     assert found["motion_rotation_deg"] < 0.75
     assert found["motion_translation_m"] < 0.015
     assert 0.3 < found["nees"] < 2.0
+
+
+def test_what_moves_keeps_its_depth_among_the_others() -> None:
+    static, moving = (
+        FeatureObservations(
+            np.array(ids),
+            np.zeros((2, 2)),
+            np.zeros((2, 2)),
+            depth_m=np.array(ids, np.float64),
+            depth_sigma_m=np.full(2, 0.1),
+        )
+        for ids in ([1, 5], [2, 9])
+    )
+    frame = FeatureFrame(0, (static,), moving=(moving,)).whole
+    np.testing.assert_array_equal(frame.cameras[0].depth_m, frame.cameras[0].ids)
+    assert frame.cameras[0].labels is None
 
 
 def test_a_slow_object_pulls_a_tightened_pose_less() -> None:

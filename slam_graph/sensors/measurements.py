@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence as PySequence
 from dataclasses import dataclass
+from typing import Any
 
 import gtsam
 import numpy as np
@@ -175,14 +176,17 @@ class FeatureObservations:
         return FeatureObservations(np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros((0, 2)))
 
     def joined(self, other: FeatureObservations) -> FeatureObservations:
-        """These and others of the same image, without descriptors and depths."""
-        labels = [seen.labels for seen in (self, other) if seen.labels is not None]
-        return FeatureObservations(
-            np.concatenate([self.ids, other.ids]),
-            np.concatenate([self.pixels, other.pixels]),
-            np.concatenate([self.normalized, other.normalized]),
-            labels=np.concatenate(labels) if len(labels) == 2 else None,
-        )
+        """These and others of the same image, without descriptors.
+
+        Depths and labels are those of both, if both have them.
+        """
+
+        def of_both(name: str) -> Any:
+            parts = [getattr(seen, name) for seen in (self, other)]
+            return None if any(part is None for part in parts) else np.concatenate(parts)
+
+        names = ("ids", "pixels", "normalized", "depth_m", "depth_sigma_m", "labels")
+        return FeatureObservations(**{name: of_both(name) for name in names})
 
     def select(self, rows: BoolArray) -> FeatureObservations:
         """Those where `rows` (N,) holds."""
