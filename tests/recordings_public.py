@@ -158,9 +158,11 @@ def write_tum_rgbd(folder: Path, frames: int = 6, size: tuple[int, int] = (640, 
             stamp = f"13050311{k // 30:02d}.{k % 30 * 33333:06d}"
             rows = size[::-1]
             shape, kind_of = ((*rows, 3), np.uint8) if kind == "rgb" else (rows, np.uint16)
-            pixels = np.random.default_rng(k).integers(0, 255, shape, dtype=kind_of)
+            pixels = np.random.default_rng(0).integers(0, 255, shape, dtype=kind_of)
             if kind == "depth":
                 pixels += 10_000  # about 2 m
+            else:  # a textured wall, along which the camera moves
+                pixels = np.roll(cv2.GaussianBlur(pixels, (0, 0), 2.0), 2 * k, axis=1)
             cv2.imwrite(str(folder / kind / f"{stamp}.png"), pixels)
             lines.append(f"{stamp} {kind}/{stamp}.png")
         write_lines(folder / f"{kind}.txt", lines)
