@@ -51,7 +51,7 @@ class SquareRootEngine:
             context.add_observations(window, frame)
         with report.timed("cost"):
             if not still:
-                slide_features(window, context.projection, context.pixels.drift.sigma_px)
+                slide_features(window, context.projection, context.drift_px)
                 window.recall_features()
             constructed = self._construction.construct(window, still)
         with report.timed("gauss_newton"):

@@ -24,6 +24,7 @@ from slam_graph.backend.cost.gating import Innovations
 from slam_graph.backend.cost.imu_factor import Propagation, VelocityCorrection
 from slam_graph.backend.cost.pixel_noise import PixelNoise
 from slam_graph.backend.cost.reprojection import RigProjection
+from slam_graph.backend.cost.selection_policies import FEATURE_POLICIES
 from slam_graph.backend.online_calibration import CalibrationVariables
 from slam_graph.backend.policies import AlgorithmConfig
 from slam_graph.backend.solve.square_root import SquareRootInformation
@@ -91,6 +92,17 @@ class EngineContext:
     def pixels(self) -> PixelNoise:
         """Noise of the observations, which the engine estimates on the way."""
         return PixelNoise(self.config.noise, len(self.rig.cameras))
+
+    @property
+    def drift_px(self) -> float:
+        """How far features of the state slide in a frame: what tracks show, else the settings.
+
+        Where features are linearised anew in every step, residuals in the window have the errors of
+        its poses in them, which look like drift.
+        """
+        if FEATURE_POLICIES[self.algorithm.cost.features].relinearized:
+            return self.config.noise.drift_px
+        return self.pixels.drift.sigma_px
 
     @cached_property
     def _motion(self) -> VisualMotion:

@@ -47,7 +47,7 @@ _LEAST_DOF = 30.0
 """Degrees of freedom of block means from which on they count for more than the settings."""
 _QUANTILE = 0.999
 """Of the distribution of a track's sum, where the sum is cut off."""
-_DEVIATIONS = 1.5
+_DEVIATIONS = 2.5
 """Standard deviations of the block means that are not taken for drift."""
 
 
