@@ -57,7 +57,8 @@ class NoiseConfig(Settings):
     far in n frames. It is process noise of the features in the state."""
     adaptive_drift: bool = expert(default=True)
     """Estimate `drift_px` from the residuals of tracks; the setting is then what holds until they
-    show it. GTSAM's smoothers take no drift."""
+    show it, and always where features are linearised anew in every step (`every_step`). GTSAM's
+    smoothers take no drift."""
     gravity: float = expert(9.81, gt=0)
     """Magnitude of gravity where it was recorded, in m/s² (9.78 at the equator, 9.83 at the
     poles)."""

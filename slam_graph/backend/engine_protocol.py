@@ -91,7 +91,8 @@ class EngineContext:
     @cached_property
     def pixels(self) -> PixelNoise:
         """Noise of the observations, which the engine estimates on the way."""
-        return PixelNoise(self.config.noise, len(self.rig.cameras))
+        with_depth = self.rig.depth is not None
+        return PixelNoise(self.config.noise, len(self.rig.cameras), with_depth)
 
     @property
     def drift_px(self) -> float:

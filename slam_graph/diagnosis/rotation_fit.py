@@ -330,6 +330,7 @@ def _least(moments: FloatArray) -> FloatArray:
 
 def _scales(sizes: FloatArray, there: BoolArray) -> FloatArray:
     """Robust standard deviations (P,) of residuals (P, N); zero where there are none."""
+    there = there & np.isfinite(sizes)
     ordered = np.sort(np.where(there, sizes, np.inf), axis=1)
     count = np.sum(there, axis=1)
     middle = np.stack([np.maximum(count - 1, 0) // 2, count // 2], axis=1)

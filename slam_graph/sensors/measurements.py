@@ -10,7 +10,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence as PySequence
 from dataclasses import dataclass
-from typing import Any
 
 import gtsam
 import numpy as np
@@ -178,15 +177,24 @@ class FeatureObservations:
     def joined(self, other: FeatureObservations) -> FeatureObservations:
         """These and others of the same image, without descriptors.
 
-        Depths and labels are those of both, if both have them.
+        Features of the one that has no depths, where the other has, have none. Labels are those of
+        both, if both have them.
         """
-
-        def of_both(name: str) -> Any:
-            parts = [getattr(seen, name) for seen in (self, other)]
-            return None if any(part is None for part in parts) else np.concatenate(parts)
-
-        names = ("ids", "pixels", "normalized", "depth_m", "depth_sigma_m", "labels")
-        return FeatureObservations(**{name: of_both(name) for name in names})
+        parts = (self, other)
+        labels = [seen.labels for seen in parts if seen.labels is not None]
+        depth_m = depth_sigma_m = None
+        if any(seen.depth_m is not None for seen in parts):
+            depth_m = np.concatenate([_or_unknown(p.depth_m, len(p)) for p in parts])
+            depth_sigma_m = np.concatenate([_or_unknown(p.depth_sigma_m, len(p)) for p in parts])
+        return FeatureObservations(
+            np.concatenate([seen.ids for seen in parts]),
+            np.concatenate([seen.pixels for seen in parts]),
+            np.concatenate([seen.normalized for seen in parts]),
+            None,
+            depth_m,
+            depth_sigma_m,
+            np.concatenate(labels) if len(labels) == 2 else None,
+        )
 
     def select(self, rows: BoolArray) -> FeatureObservations:
         """Those where `rows` (N,) holds."""
@@ -199,6 +207,11 @@ class FeatureObservations:
             None if self.depth_sigma_m is None else self.depth_sigma_m[rows],
             None if self.labels is None else self.labels[rows],
         )
+
+
+def _or_unknown(depths: FloatArray | None, count: int) -> FloatArray:
+    """Depths (N,), or NaN where there are none."""
+    return np.full(count, np.nan) if depths is None else depths
 
 
 @dataclass(frozen=True, slots=True, eq=False)

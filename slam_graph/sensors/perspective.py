@@ -57,6 +57,8 @@ def camera_pose(
     )
     for _ in range(_TIGHTENED if tightened else 0):
         errors = _errors(points, rays, rotation, translation)
+        if not np.any(errors < error):
+            break
         median = float(np.median(errors[errors < error]))
         chosen = np.flatnonzero(errors < min(error, _MEDIANS * median))
         if len(chosen) < max(least, _FEWEST):

@@ -57,15 +57,10 @@ def gate_by_consensus(
     fitting = _fitting(cost, linear)
     if fitting is None:
         return first
-    posterior = predicted
-    for rows in _rows(cost, linear, predicted, fitting):
-        posterior = posterior.updated(rows)
     try:
-        moved = posterior.solution()
-    except np.linalg.LinAlgError:
+        second = _second_gate(cost, linear, predicted, fitting, tested)
+    except np.linalg.LinAlgError:  # the features that fit do not determine the step
         return first
-    after = _after(cost, linear, moved, predicted)
-    second = cost.gate(after, posterior.shifted(-moved), tested, _CONFIDENCE)
     landmarks = first.landmarks & (fitting.landmarks | second.landmarks)
     tracks = first.tracks & (fitting.tracks | second.tracks)
     left_out = np.count_nonzero(first.landmarks & ~landmarks)
@@ -75,17 +70,36 @@ def gate_by_consensus(
     return Gate(landmarks, tracks, innovations)
 
 
+def _second_gate(
+    cost: Cost,
+    linear: Linearization,
+    predicted: SquareRootInformation,
+    fitting: _Fitting,
+    tested: BoolArray | None,
+) -> Gate:
+    """The gate against what is known once the features that fit have updated the prediction."""
+    posterior = predicted
+    for rows in _rows(cost, linear, predicted, fitting):
+        posterior = posterior.updated(rows)
+    moved = posterior.solution()
+    after = _after(cost, linear, moved, predicted)
+    return cost.gate(after, posterior.shifted(-moved), tested, _CONFIDENCE)
+
+
 def _fitting(cost: Cost, linear: Linearization) -> _Fitting | None:
     """The features without outliers at the linearisation point, None if these are too few.
 
     The limit follows the errors themselves, most of which are of features at rest.
     """
-    if not len(linear.errors):
+    errors = linear.errors[np.isfinite(linear.errors)]
+    if not len(errors):
         return None
-    limit = WIDTH_2D / _MEDIAN_2D * float(np.median(linear.errors))
+    limit = WIDTH_2D / _MEDIAN_2D * float(np.median(errors))
     landmarks, tracks = np.zeros(0, np.bool_), np.zeros(0, np.bool_)
     if linear.landmarks is not None:
         landmarks = linear.landmarks.errors < limit
+        # nearer or behind, the slope of the projection tells nothing
+        landmarks &= linear.landmarks.depths >= cost.config.triangulation.min_depth_m
     if linear.tracks is not None and cost.tracks is not None:
         assert isinstance(linear.tracks, WhitenedObservations)
         worst = np.zeros(len(cost.tracks.points))

@@ -84,8 +84,17 @@ class PixelNoise:
         drift: how far tracks slide off their points.
     """
 
-    def __init__(self, config: NoiseConfig, cameras: int) -> None:
+    def __init__(self, config: NoiseConfig, cameras: int, with_depth: bool = False) -> None:
+        """Begin with the settings.
+
+        Args:
+            config: the settings.
+            cameras: their number.
+            with_depth: whether the last one stands for a depth sensor. It tells no drift: its
+                errors are those of depths.
+        """
         self._config = config
+        self._tracking = cameras - with_depth
         self.drift = TrackDrift(config)
         self.sigma_px = self.estimate_px = np.full(cameras, config.pixel_sigma)
         self._dof = np.full(cameras, _PRIOR_DOF)
@@ -125,7 +134,7 @@ class PixelNoise:
         known = tracks.subset(is_in(tracks.obs.ids, cost.tracks.obs.ids))
         if len(known.obs):
             residuals, by_point = _linearized(cost, known)
-            self.drift.learn(known.obs, residuals, by_point, len(self.sigma_px), stamp_ns)
+            self.drift.learn(known.obs, residuals, by_point, self._tracking, stamp_ns)
 
     def _learn_noise(self, cost: Cost, tracks: TrackFeatures | None, stamp_ns: int) -> None:
         """Learn how noisy each camera is."""

@@ -153,12 +153,12 @@ def slide_features(window: Window, rig: RigProjection, sigma_px: float) -> None:
     poses = rig.when_taken(obs.frames, *window.state.poses(obs.frames))
     at = Geometry(*poses, window.state.positions_of(ids))
     J = rig.derivatives(obs, at, rig.views(obs, at))[1]
-    # J⁺ J⁺ᵀ = Jᵀ (J Jᵀ)⁻² J
-    root = np.linalg.solve(J @ J.transpose(0, 2, 1), J)
     known = features_of(window.prior.layout)  # its first columns
     order = np.argsort(known)
     noise = np.zeros((len(known), POINT_DIM, POINT_DIM))
     sliding = order[np.searchsorted(known, ids, sorter=order)]
-    noise[sliding] = EVERY_FRAMES * sigma_px**2 * root.transpose(0, 2, 1) @ root
     with contextlib.suppress(np.linalg.LinAlgError):  # not determined: the steps will say so
+        # J⁺ J⁺ᵀ = Jᵀ (J Jᵀ)⁻² J
+        root = np.linalg.solve(J @ J.transpose(0, 2, 1), J)
+        noise[sliding] = EVERY_FRAMES * sigma_px**2 * root.transpose(0, 2, 1) @ root
         window.prior = window.prior.with_noise(noise)

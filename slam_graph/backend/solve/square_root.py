@@ -370,6 +370,8 @@ def triangularize(Ab: FloatArray) -> FloatArray:
 
 def trapezoidal(Ab: FloatArray) -> FloatArray:
     """The upper factor of a QR decomposition of (m, n) rows, (min(m, n), n)."""
+    if not len(Ab):
+        return Ab
     qr, _, _, info = lapack.dgeqrf(np.asfortranarray(Ab))
     if info != 0:
         raise ValueError(f"LAPACK's geqrf rejected argument {-info}")
