@@ -151,8 +151,8 @@ class Recorded(PixelNoise):
 
     last: PixelNoise
 
-    def __init__(self, config: NoiseConfig, cameras: int) -> None:
-        super().__init__(config, cameras)
+    def __init__(self, config: NoiseConfig, cameras: int, with_depth: bool) -> None:
+        super().__init__(config, cameras, with_depth)
         Recorded.last = self
 
 
