@@ -152,11 +152,10 @@ def _pass_on(signum: int, frame: FrameType | None) -> None:
 
 
 def end_with(pipe: int) -> None:
-    """End this process, as by Ctrl-C, when the other end of a pipe is closed.
+    """End this process when the other end of a pipe is closed, as by Ctrl-C.
 
     The process that holds that end need not do anything: it is closed also when it is killed.
-    Where SIGINT is ignored, as in a background job of a shell, SIGTERM takes its place
-    (see `terminate_like_interrupt`).
+    Needs `terminate_like_interrupt`: a background job of a shell ignores SIGINT.
 
     Args:
         pipe: file descriptor to read from; nothing is ever written to it.
@@ -165,8 +164,7 @@ def end_with(pipe: int) -> None:
     def wait() -> None:
         while os.read(pipe, 1):
             continue
-        ignored = signal.getsignal(signal.SIGINT) == signal.SIG_IGN
-        os.kill(os.getpid(), signal.SIGTERM if ignored else signal.SIGINT)
+        os.kill(os.getpid(), signal.SIGTERM)
         time.sleep(_GRACE_S)
         os.kill(os.getpid(), signal.SIGKILL)
 

@@ -35,7 +35,7 @@ class SquareRootEngine:
             context.config,
             context.diagnostics,
             context.pixels,
-            vague=context.config.dynamics.start_at_images and not context.rig.has_imu,
+            without_prediction=context.config.dynamics.start_at_images and not context.rig.has_imu,
         )
         self._posterior: SquareRootInformation | None = None
         self._cost: Cost | None = None
@@ -51,7 +51,7 @@ class SquareRootEngine:
             context.add_observations(window, frame)
         with report.timed("cost"):
             if not still:
-                slide_features(window, context.projection, context.drift_px)
+                slide_features(window, context.projection, context.pixels.drift.sigma_px)
                 window.recall_features()
             constructed = self._construction.construct(window, still)
         with report.timed("gauss_newton"):

@@ -90,27 +90,22 @@ class EngineContext:
 
     @cached_property
     def pixels(self) -> PixelNoise:
-        """Noise of the observations, which the engine estimates on the way."""
-        with_depth = self.rig.depth is not None
-        return PixelNoise(self.config.noise, len(self.rig.cameras), with_depth)
-
-    @property
-    def drift_px(self) -> float:
-        """How far features of the state slide in a frame: what tracks show, else the settings.
+        """Noise of the observations, which the engine estimates on the way.
 
         Where features are linearised anew in every step, residuals in the window have the errors of
-        its poses in them, which look like drift.
+        its poses in them, which look like drift: there it stays what the settings say.
         """
-        if FEATURE_POLICIES[self.algorithm.cost.features].relinearized:
-            return self.config.noise.drift_px
-        return self.pixels.drift.sigma_px
+        anew = FEATURE_POLICIES[self.algorithm.cost.features].relinearized
+        learns = self.config.noise.adaptive_drift and not anew
+        noise = self.config.noise.model_copy(update={"adaptive_drift": learns})
+        return PixelNoise(noise, len(self.rig.cameras), self.rig.depth is not None)
 
     @cached_property
     def _motion(self) -> VisualMotion:
         return VisualMotion(self.rig, self.config.dynamics.min_points)
 
     def note(self, frame: FeatureFrame) -> None:
-        """Note the frame of a start: what it has a depth of tells the motion to the next one."""
+        """Remember the first frame: its depths give the points for PnP in the second one."""
         if self.config.dynamics.start_at_images:
             self._motion.note(frame)
 

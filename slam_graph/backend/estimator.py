@@ -44,7 +44,7 @@ from slam_graph.geometry import NavState
 from slam_graph.sensors import FeatureFrame, ImuBuffer, ImuData, Rig
 
 _HISTORY_NS, _MAX_AHEAD_NS = 10_000_000_000, 10_000_000_000
-"""How long IMU samples are kept; a frame later than the last one by more has a wrong stamp."""
+"""How long IMU samples are kept, and how much later than the last sample a frame may be."""
 _LEAD_NS = 1_000_000_000
 """A given state may be this much older than the first frame after a new beginning."""
 _ROUNDS, _REPEATED_S = 3, 1e-3

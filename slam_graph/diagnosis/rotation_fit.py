@@ -112,7 +112,7 @@ class _Turned:
         return np.asarray(sum(part @ part.swapaxes(-1, -2) for part in spread))
 
     @cached_property
-    def _largest(self) -> FloatArray:
+    def _squared_derivatives(self) -> FloatArray:
         """(P, N) squared derivatives of the bearings, summed."""
         parts = (self.by_one, self.by_two)
         return np.asarray(sum(np.einsum("pnij,pnij->pn", part, part) for part in parts))
@@ -125,7 +125,7 @@ class _Turned:
             np.einsum("pni,pnij->pnj", self.one @ along, self.by_two),
         )
         variance = sum(np.einsum("pnj,pnj->pn", part, part) for part in by_pixels)
-        sigma = np.sqrt(np.maximum(variance, _LEAST_VARIANCE * self._largest + 1e-12))
+        sigma = np.sqrt(np.maximum(variance, _LEAST_VARIANCE * self._squared_derivatives + 1e-12))
         return np.einsum("pni,pi->pn", self.normals, t) / sigma, sigma
 
 
@@ -329,7 +329,12 @@ def _least(moments: FloatArray) -> FloatArray:
 
 
 def _scales(sizes: FloatArray, there: BoolArray) -> FloatArray:
-    """Robust standard deviations (P,) of residuals (P, N); zero where there are none."""
+    """Robust standard deviations (P,) of residuals (P, N); zero where there are none.
+
+    `np.nanmedian` takes many times as long.
+    """
+    if sizes.shape[1] == 0:
+        return np.zeros(len(sizes))
     there = there & np.isfinite(sizes)
     ordered = np.sort(np.where(there, sizes, np.inf), axis=1)
     count = np.sum(there, axis=1)

@@ -117,8 +117,9 @@ def _is_whole(table: Table) -> bool:
 
 def _is_number(value: object) -> bool:
     """Whether a value is a number of which a mean can be taken."""
-    known = isinstance(value, int | float) and not isinstance(value, bool)
-    return known and abs(value) <= Files.LARGEST  # type: ignore[arg-type]
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return False
+    return abs(value) <= Files.LARGEST
 
 
 def read_series(path: Path) -> Series:

@@ -63,10 +63,9 @@ class _Remembered:
         """Keep some of the corners only."""
         self.tracks, self.tries = self.tracks.select(which), self.tries[which]
 
-    def sought(self, missing: BoolArray) -> IntArray:
-        """Rows of the corners to look for, of those (N,) that should be in view and are missing."""
+    def forget_tries(self, missing: BoolArray) -> None:
+        """Begin to count anew for corners but those (N,) that are missing and should be in view."""
         self.tries[~missing] = 0
-        return np.flatnonzero(missing & (self.tries < _TRIES))
 
 
 class LostFeatures:
@@ -163,7 +162,11 @@ class LostFeatures:
         missing = visible & ~np.isin(ids, after.ids)
         ends = np.cumsum([len(past.tracks) for past in self._past])[:-1]
         parts = zip(self._past, np.split(missing, ends), strict=True)
-        return [past.sought(of_image) for past, of_image in parts]
+        sought = []
+        for past, of_image in parts:
+            past.forget_tries(of_image)
+            sought.append(np.flatnonzero(of_image & (past.tries < _TRIES)))
+        return sought
 
     def _count_tries(self, ids: IntArray) -> None:
         """Note that corners are looked for, whichever image they are taken from."""

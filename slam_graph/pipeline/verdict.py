@@ -42,7 +42,7 @@ _HINDERING = {"gyroscope_scale": 0.1, "baseline": 0.3}
 _RUINING = _HINDERING | {"focal_length": 0.2}
 """Those from which an estimate that goes on is worth nothing."""
 _RUINING_DEG = 6.0
-"""Least error of the mounting, in degrees, that does the same."""
+"""The same for the error of a camera's mounting, in degrees."""
 _FAILED = ("not_initialized", "diverged", "low_coverage")
 _DOUBTS = ("start_corrected", "new_segment", "scale_unknown")
 """Warnings after which an estimate that came to its end is doubted."""

@@ -177,8 +177,8 @@ class FeatureObservations:
     def joined(self, other: FeatureObservations) -> FeatureObservations:
         """These and others of the same image, without descriptors.
 
-        Features of the one that has no depths, where the other has, have none. Labels are those of
-        both, if both have them.
+        Where only one of the two has depths, those of the other are NaN. Labels are those of both,
+        if both have them.
         """
         parts = (self, other)
         labels = [seen.labels for seen in parts if seen.labels is not None]

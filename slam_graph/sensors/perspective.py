@@ -13,9 +13,12 @@ from slam_graph.arrays import BoolArray, FloatArray
 
 RANSAC_ITERATIONS = 200
 _CONFIDENCE = 0.999
-_TIGHTENED, _MEDIANS, _FEWEST = 2, 2.1, 6
-"""How often points are chosen again, up to how many medians of their errors (95 % of normal ones),
-and how many must be left."""
+_TIGHTENED = 2
+"""How often the points that fit are chosen again."""
+_MAX_MEDIANS = 2.1
+"""Largest error of these, in medians: 95 % of two-dimensional normal errors are smaller."""
+_FEWEST = 6
+"""Fewer points are no better choice."""
 
 
 def camera_pose(
@@ -60,21 +63,20 @@ def camera_pose(
         if not np.any(errors < error):
             break
         median = float(np.median(errors[errors < error]))
-        chosen = np.flatnonzero(errors < min(error, _MEDIANS * median))
+        chosen = np.flatnonzero(errors < min(error, _MAX_MEDIANS * median))
         if len(chosen) < max(least, _FEWEST):
             break
         rotation, translation = cv2.solvePnPRefineLM(
             points[chosen], rays[chosen], np.eye(3), None, rotation, translation
         )
-    matrix = cv2.Rodrigues(rotation)[0]
-    ahead = (points @ matrix.T + translation.T)[:, 2] > 0
-    pose = gtsam.Pose3(gtsam.Rot3(matrix), translation[:, 0])
-    return pose, (_errors(points, rays, rotation, translation) < error) & ahead
+    pose = gtsam.Pose3(gtsam.Rot3(cv2.Rodrigues(rotation)[0]), translation[:, 0])
+    return pose, _errors(points, rays, rotation, translation) < error
 
 
 def _errors(
     points: FloatArray, rays: FloatArray, rotation: MatLike, translation: MatLike
 ) -> FloatArray:
-    """How far (N,) points are from where they are seen, on the plane z = 1."""
+    """How far (N,) points are from where they are seen, on the plane z = 1; infinite if behind."""
     seen = cv2.projectPoints(points, rotation, translation, np.eye(3), None)[0][:, 0]
-    return np.asarray(np.linalg.norm(seen - rays, axis=1))
+    ahead = (points @ cv2.Rodrigues(rotation)[0].T + translation.T)[:, 2] > 0
+    return np.asarray(np.where(ahead, np.linalg.norm(seen - rays, axis=1), np.inf))

@@ -20,15 +20,13 @@ from slam_graph.backend.cost.cost import Cost, Linearization
 from slam_graph.backend.cost.feature_factors import WhitenedObservations, sum_features
 from slam_graph.backend.cost.gating import Gate
 from slam_graph.backend.cost.measurement_rows import columns_of_state
-from slam_graph.backend.cost.robust_loss import WIDTH_2D
+from slam_graph.backend.cost.robust_loss import MEDIAN_2D, WIDTH_2D
 from slam_graph.backend.solve.square_root import SquareRootInformation
 
 _FEWEST, _LEAST_SHARE = 10, 0.5
 """Fewer features, or a smaller part of them, are no consensus."""
 _CONFIDENCE = 0.99
-"""Share of the good features without a consensus that pass the second test."""
-_MEDIAN_2D = 1.18
-"""Median length of a two-dimensional normal error, in standard deviations."""
+"""Share of features at rest that pass the second test, of those that did not fit before."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -49,25 +47,20 @@ def gate_by_consensus(
 
     Args:
         cost: the cost of the step.
-        linear: of it, not summed up, without the weights of a robust loss.
+        linear: of it, not summed up, without the weights of Cauchy's loss.
         predicted: what is known of the variables before these measurements.
         tested: (J,) which of the new features are tested; all of them if it is not given.
     """
-    first = cost.gate(linear, predicted, tested)
     fitting = _fitting(cost, linear)
     if fitting is None:
-        return first
+        return cost.gate(linear, predicted, tested)
     try:
         second = _second_gate(cost, linear, predicted, fitting, tested)
     except np.linalg.LinAlgError:  # the features that fit do not determine the step
-        return first
-    landmarks = first.landmarks & (fitting.landmarks | second.landmarks)
-    tracks = first.tracks & (fitting.tracks | second.tracks)
-    left_out = np.count_nonzero(first.landmarks & ~landmarks)
-    left_out += np.count_nonzero(first.tracks & ~tracks)
-    innovations = first.innovations
-    innovations = replace(innovations, rejected=innovations.rejected + int(left_out))
-    return Gate(landmarks, tracks, innovations)
+        return cost.gate(linear, predicted, tested)
+    tracks = fitting.tracks | second.tracks
+    admitted = fitting.landmarks | second.landmarks, tracks if tested is None else tracks[tested]
+    return cost.gate(linear, predicted, tested, admitted=admitted)
 
 
 def _second_gate(
@@ -83,7 +76,7 @@ def _second_gate(
         posterior = posterior.updated(rows)
     moved = posterior.solution()
     after = _after(cost, linear, moved, predicted)
-    return cost.gate(after, posterior.shifted(-moved), tested, _CONFIDENCE)
+    return cost.gate(after, posterior, tested, _CONFIDENCE)
 
 
 def _fitting(cost: Cost, linear: Linearization) -> _Fitting | None:
@@ -94,7 +87,7 @@ def _fitting(cost: Cost, linear: Linearization) -> _Fitting | None:
     errors = linear.errors[np.isfinite(linear.errors)]
     if not len(errors):
         return None
-    limit = WIDTH_2D / _MEDIAN_2D * float(np.median(errors))
+    limit = WIDTH_2D / MEDIAN_2D * float(np.median(errors))
     landmarks, tracks = np.zeros(0, np.bool_), np.zeros(0, np.bool_)
     if linear.landmarks is not None:
         landmarks = linear.landmarks.errors < limit

@@ -113,7 +113,7 @@ class CostConstruction:
         config: BackendConfig,
         diagnostics: Diagnostics,
         pixels: PixelNoise,
-        vague: bool = False,
+        without_prediction: bool = False,
     ) -> None:
         """Take what all steps have in common.
 
@@ -123,7 +123,7 @@ class CostConstruction:
             config: settings that do not depend on the algorithm.
             diagnostics: counts what is rejected.
             pixels: the noise of observations.
-            vague: whether nothing but images tells the pose of a new frame.
+            without_prediction: whether nothing but images tells the pose of a new frame.
         """
         self.policy = policy
         self.rig = rig
@@ -135,7 +135,7 @@ class CostConstruction:
         self._selection = FeatureSelection(policy, rig, config, diagnostics, pixels)
         self._select_poses = POSE_SELECTIONS[policy.past_poses]
         self._loss = RobustLoss(config.gating.loss)
-        self._vague = vague
+        self._without_prediction = without_prediction
         self._failures: dict[int, int] = {}
 
     def construct(self, window: Window, still: bool) -> ConstructedCost:
@@ -325,7 +325,7 @@ class CostConstruction:
         """What passes the χ² test, by the prediction or by what most features show."""
         if self._loss.vanishes:
             linear = linear.unweighted(self._loss)
-        if self._vague:
+        if self._without_prediction:
             return gate_by_consensus(cost, linear, predicted, tested)
         return cost.gate(linear, predicted, tested)
 

@@ -335,6 +335,7 @@ class Cost:
         predicted: SquareRootInformation,
         tested: BoolArray | None = None,
         confidence: float | None = None,
+        admitted: tuple[BoolArray | bool, BoolArray | bool] = (True, True),
     ) -> Gate:
         """Which tracked observations and new features pass the χ² test.
 
@@ -344,6 +345,7 @@ class Cost:
             predicted: what is known of the variables before these measurements.
             tested: (J,) which of the new features are tested; all of them if it is not given.
             confidence: share of good ones that pass; that of the settings if it is not given.
+            admitted: which observations (N,) and which of the tested features may pass; else all.
         """
         landmarks = np.zeros(0, np.bool_)
         tracks = np.zeros(0, np.bool_)
@@ -359,7 +361,7 @@ class Cost:
             largest = threshold(dof, confidence)
             # nearer or behind, the slope of the projection is so large that any residual would pass
             near = linear.landmarks.depths < self.config.triangulation.min_depth_m
-            landmarks = (distance < largest) & ~near
+            landmarks = (distance < largest) & ~near & admitted[0]
             innovations += Innovations.of(distance, dof, largest, landmarks)
         if linear.tracks is not None and self.tracks is not None:
             assert not isinstance(linear.tracks, SummedFeatures), "these are not told apart"
@@ -372,7 +374,7 @@ class Cost:
             distance = distances_of_tracks(obs, observations, covariance)
             dof = 2 * obs.counts - POINT_DIM
             largest = threshold(dof, confidence)
-            passed = distance < largest
+            passed = (distance < largest) & admitted[1]
             innovations += Innovations.of(distance, dof, largest, passed)
             tracks = is_in(self.tracks.obs.ids, obs.ids[passed])
         return Gate(landmarks, tracks, innovations)

@@ -25,7 +25,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import gammainc, gammaincinv
 
 from slam_graph.arrays import FloatArray
 from slam_graph.backend.backend_config import NoiseConfig
@@ -33,6 +32,7 @@ from slam_graph.backend.cost.cost import Cost, TrackFeatures
 from slam_graph.backend.cost.feature_tracks import Observations, is_in
 from slam_graph.backend.cost.reprojection import Geometry
 from slam_graph.backend.cost.track_drift import TrackDrift
+from slam_graph.backend.cost.winsorised import winsorised
 from slam_graph.kernels.feature_sums import block_sums, extents
 
 BLOCK = 8
@@ -67,13 +67,6 @@ class BlockMeans:
     squares: FloatArray
     dof: FloatArray
 
-    def winsorised(self) -> FloatArray:
-        """(J,) squares, cut off where normal noise seldom is, with mean one under such noise."""
-        half = 0.5 * self.dof
-        largest = gammaincinv(half, _QUANTILE)
-        expected = gammainc(half + 1.0, largest) + largest / half * (1.0 - _QUANTILE)
-        return np.asarray(np.minimum(self.squares, largest / half) / expected, dtype=np.float64)
-
 
 class PixelNoise:
     """Standard deviation of the observations of each camera, as the tracks show it.
@@ -90,8 +83,7 @@ class PixelNoise:
         Args:
             config: the settings.
             cameras: their number.
-            with_depth: whether the last one stands for a depth sensor. It tells no drift: its
-                errors are those of depths.
+            with_depth: whether the last one stands for a depth sensor, which shows no drift.
         """
         self._config = config
         self._tracking = cameras - with_depth
@@ -115,47 +107,43 @@ class PixelNoise:
                 noise that is larger than assumed would not be seen.
             stamp_ns: time of the step.
         """
-        if tracks is not None:
-            telling = tracks.obs.counts >= _MIN_OBSERVATIONS
-            telling &= _extents_px(tracks.obs, len(self.sigma_px)) >= _LEAST_MOTION_PX
-            tracks = tracks.subset(telling)
-        self._learn_noise(cost, tracks, stamp_ns)
-        if self._config.adaptive_drift:
-            self._learn_drift(cost, tracks, stamp_ns)
-
-    def _learn_drift(self, cost: Cost, tracks: TrackFeatures | None, stamp_ns: int) -> None:
-        """Learn from the tracks that passed the gate, in one step of several.
-
-        Features of the state pass it in every frame: what it rejects says nothing of them.
-        """
         self._steps += 1
-        if tracks is None or cost.tracks is None or self._steps % _DRIFT_STEPS:
+        forget = self._forgotten(stamp_ns)
+        self._dof, self._squares = forget * self._dof, forget * self._squares
+        if tracks is None:
             return
-        known = tracks.subset(is_in(tracks.obs.ids, cost.tracks.obs.ids))
-        if len(known.obs):
-            residuals, by_point = _linearized(cost, known)
-            self.drift.learn(known.obs, residuals, by_point, self._tracking, stamp_ns)
-
-    def _learn_noise(self, cost: Cost, tracks: TrackFeatures | None, stamp_ns: int) -> None:
-        """Learn how noisy each camera is."""
-        if self._config.adaptive_pixels == "never":
-            return
-        if self._stamp_ns is not None:
-            memory = np.exp(-(stamp_ns - self._stamp_ns) * 1e-9 / _MEMORY_S)
-            self._dof, self._squares = memory * self._dof, memory * self._squares
-        self._stamp_ns = stamp_ns
-        if tracks is None or len(tracks.obs) == 0:
+        telling = tracks.obs.counts >= _MIN_OBSERVATIONS
+        telling &= _extents_px(tracks.obs, len(self.sigma_px)) >= _LEAST_MOTION_PX
+        tracks = tracks.subset(telling)
+        asks_drift = self._config.adaptive_drift and self._steps % _DRIFT_STEPS == 0
+        asks_noise = self._config.adaptive_pixels != "never"
+        if len(tracks.obs) == 0 or not (asks_drift or asks_noise):
             return
         residuals, by_point = _linearized(cost, tracks)
-        sigma = self.sigma_px[tracks.obs.camera]
+        if asks_noise:
+            self._learn_noise(tracks.obs, residuals, by_point)
+        if asks_drift and cost.tracks is not None:
+            # only these resemble features of the state, which pass the gate in every frame
+            passed = is_in(tracks.obs.ids, cost.tracks.obs.ids)
+            obs, rows = tracks.obs.subset(passed), passed[tracks.obs.feature]
+            self.drift.learn(obs, residuals[rows], by_point[rows], self._tracking, stamp_ns)
+
+    def _forgotten(self, stamp_ns: int) -> float:
+        """What is left of the weight of tracks since the last step."""
+        last, self._stamp_ns = self._stamp_ns, stamp_ns
+        return 1.0 if last is None else float(np.exp(-(stamp_ns - last) * 1e-9 / _MEMORY_S))
+
+    def _learn_noise(self, obs: Observations, residuals: FloatArray, by_point: FloatArray) -> None:
+        """Learn how noisy each camera is from residuals (N, 2) and their derivatives, in pixels."""
+        sigma = self.sigma_px[obs.camera]
         parts = residuals / sigma[:, None], by_point / sigma[:, None, None]
         try:
-            found = block_means(tracks.obs, *parts, len(self.sigma_px))
+            found = block_means(obs, *parts, len(self.sigma_px))
         except np.linalg.LinAlgError:  # a point that its observations do not determine
             return
         for camera, means in enumerate(found):
             self._dof[camera] += np.sum(means.dof)
-            share = float(means.dof @ means.winsorised())
+            share = float(means.dof @ winsorised(means.squares, means.dof, _QUANTILE))
             self._squares[camera] += share * self.sigma_px[camera] ** 2
         setting = self._config.pixel_sigma
         sigma_px = np.sqrt(self._squares / self._dof)

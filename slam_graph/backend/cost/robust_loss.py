@@ -8,6 +8,7 @@ and linear beyond, Cauchy's is c²/2 log(1 + e²/c²), whose weight vanishes for
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Literal
 
@@ -19,6 +20,9 @@ LossName = Literal["none", "huber", "cauchy"]
 
 WIDTH_2D = 2.45
 """The length that 95 % of all two-dimensional residuals without outliers do not exceed."""
+
+MEDIAN_2D = math.sqrt(2.0 * math.log(2.0))
+"""The length that half of them do not exceed."""
 
 
 @dataclass(frozen=True, slots=True)

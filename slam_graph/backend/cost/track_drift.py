@@ -27,16 +27,18 @@ from __future__ import annotations
 import contextlib
 
 import numpy as np
-from scipy.special import gammainc, gammaincinv
 
 from slam_graph.arrays import FloatArray
 from slam_graph.backend.backend_config import NoiseConfig
 from slam_graph.backend.cost.feature_tracks import Observations, is_in
 from slam_graph.backend.cost.reprojection import Geometry, RigProjection
+from slam_graph.backend.cost.winsorised import winsorised
 from slam_graph.backend.solve.state import POINT_DIM, features_of
 from slam_graph.backend.window import Window
 from slam_graph.kernels.feature_sums import block_sums
 
+_LEAST_VARIANCE = 1e-6
+"""Of white noise, px²: simulated tracks may have none."""
 EVERY_FRAMES = 6
 """Features slide once in so many frames, for as many frames: it takes time."""
 _BLOCKS = (1, 8)
@@ -76,7 +78,7 @@ class TrackDrift:
             obs: N observations of J features, each of them offered once.
             r: (N, 2) residuals in pixels.
             by_point: (N, 2, 3) derivatives by the position of the feature.
-            cameras: their number.
+            cameras: how many cameras count, the first ones.
             stamp_ns: time of the step.
         """
         if self._stamp_ns is not None:
@@ -96,7 +98,7 @@ class TrackDrift:
     def _add(
         self, k: int, squares: FloatArray, white: FloatArray, white2: FloatArray, walk: FloatArray
     ) -> None:
-        """Add tracks, cut off where they are seldom under what is known by now.
+        """Add the sums of tracks, each cut off at a quantile under the present variances.
 
         Args:
             k: which block.
@@ -109,13 +111,11 @@ class TrackDrift:
         expected = noise * white + drift * walk
         # that of a walk is mostly one direction of each axis
         spread = noise * np.sqrt(white2) + drift * walk / np.sqrt(2.0)
-        half = 0.5 * (expected / spread) ** 2
-        largest = gammaincinv(half, _QUANTILE) / half
-        left = gammainc(half + 1.0, largest * half) + largest * (1.0 - _QUANTILE)
-        shares = np.minimum(squares / expected, largest) / left
+        dof = (expected / spread) ** 2
+        shares = winsorised(squares / expected, dof, _QUANTILE)
         self._squares[k] += shares @ expected
         self._traces[k] += np.array([white.sum(), walk.sum()])
-        self._dof[k] += 2.0 * half.sum()
+        self._dof[k] += dof.sum()
 
     def _solve(self) -> None:
         """The two variances, and the drift that the block means clearly show."""
@@ -128,16 +128,16 @@ class TrackDrift:
 
 def _nonnegative(traces: FloatArray, squares: FloatArray) -> FloatArray:
     """Variances (2,) of white noise and walk, neither below zero; the noise stays above it."""
-    white = squares[0] / traces[0, 0]
+    white = max(squares[0] / traces[0, 0], _LEAST_VARIANCE)
     noise, drift = np.linalg.solve(traces, squares)
     return np.array([max(noise, 1e-3 * white), drift]) if drift > 0.0 else np.array([white, 0.0])
 
 
 def slide_features(window: Window, rig: RigProjection, sigma_px: float) -> None:
-    """Let the features of the state that the current frame sees slide since the last time.
+    """Let the features of the state that have waiting observations slide since the last time.
 
-    What is known of features that were lost is known given the others, where these were. So nothing
-    is kept of them any more once features slide.
+    A lost feature is stored as a conditional given other variables where they were then. Sliding
+    makes it outdated, so the store is closed for good.
 
     Args:
         window: with the observations of the current frame, and its predicted pose.
@@ -146,8 +146,10 @@ def slide_features(window: Window, rig: RigProjection, sigma_px: float) -> None:
     """
     if sigma_px == 0.0 or window.frame % EVERY_FRAMES or not len(window.state_features):
         return
-    window.lost_features.close()
     ids = window.state_features[is_in(window.state_features, window.tracks.ids_waiting())]
+    if not len(ids):
+        return
+    window.lost_features.close()
     obs = window.tracks.observations(ids)
     obs, rig = obs.rows(obs.starts[:-1]), rig.at(window.state)  # where the first camera sees them
     poses = rig.when_taken(obs.frames, *window.state.poses(obs.frames))

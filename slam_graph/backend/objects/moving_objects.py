@@ -60,8 +60,9 @@ class MovingObjects(ObjectHistory):
         first = max([0, *self.numbers, *(seen.number for seen in self.directions)]) + 1
         self._directions = DirectionTracker(rig, backend, config, first)
         self._rig = rig
-        both = replace(with_depth_camera(rig), depth=None)  # depth is what a second camera sees
-        self._tracker = ObjectTracker(both, policies, backend, config, first)
+        # depth is what a second camera sees
+        with_virtual = replace(with_depth_camera(rig), depth=None)
+        self._tracker = ObjectTracker(with_virtual, policies, backend, config, first)
 
     def take(self, frame: FeatureFrame, state: NavState, estimator: Estimator) -> ObjectFrame:
         """Take a frame, and leave what moves out of the estimate of the platform.

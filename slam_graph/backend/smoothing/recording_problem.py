@@ -21,7 +21,7 @@ import numpy as np
 from slam_graph.arrays import BoolArray, FloatArray, IntArray
 from slam_graph.backend.cost.feature_tracks import Observations
 from slam_graph.backend.cost.reprojection import Geometry, RigProjection
-from slam_graph.backend.cost.robust_loss import RobustLoss
+from slam_graph.backend.cost.robust_loss import MEDIAN_2D, RobustLoss
 from slam_graph.backend.depth_camera import is_of_depth
 from slam_graph.backend.smoothing.adjustment_figures import AdjustmentFigures
 from slam_graph.backend.smoothing.cost_minimization import minimized
@@ -69,7 +69,6 @@ OUTLIER_WIDTH = 3.7
 circle)."""
 _MIN_KEYFRAMES = 3
 """A feature must be seen in this many keyframes."""
-_RAYLEIGH_MEDIAN = math.sqrt(2.0 * math.log(2.0))
 _MIN_SIGMA_RATIO = 0.1
 """The learned noise of the tracks is at least this part of the configured one."""
 _LOOSE_TOLERANCE = 1e-3
@@ -204,7 +203,7 @@ class BundleAdjustment:
         freedom = 2 * len(obs) - unknowns
         if freedom <= unknowns:
             return
-        sigma_px = float(np.median(lengths)) / _RAYLEIGH_MEDIAN * math.sqrt(2 * len(obs) / freedom)
+        sigma_px = float(np.median(lengths)) / MEDIAN_2D * math.sqrt(2 * len(obs) / freedom)
         configured_px = self._backend.noise.pixel_sigma
         self._sigma_px = float(np.clip(sigma_px, _MIN_SIGMA_RATIO * configured_px, configured_px))
 

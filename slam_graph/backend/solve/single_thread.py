@@ -34,9 +34,10 @@ class SingleThread:
 
 @cache
 def _blas_libraries() -> ThreadpoolController:
-    """Those of NumPy and SciPy; to look for them takes milliseconds, and each object has an engine.
+    """BLAS libraries of NumPy and SciPy, searched for once.
 
-    Both are loaded before anything is solved.
+    That takes milliseconds, and every moving object has an engine. Both are loaded before anything
+    is solved.
     """
     return ThreadpoolController().select(user_api="blas")
 

@@ -120,8 +120,8 @@ def _read_poses(path: Path) -> FloatArray:
 def _are_poses(matrices: FloatArray) -> BoolArray:
     """Which matrices (N, 3, 4) are finite, with a rotation in their first three columns."""
     defects, dets = rotation_defects(matrices[:, :, :3])
-    near = Files.are_measurable(matrices).all(axis=(1, 2))
-    return np.asarray(near & (dets > 0.0) & (defects <= ROTATION_TOLERANCE), bool)
+    measurable = Files.are_measurable(matrices).all(axis=(1, 2))
+    return np.asarray(measurable & (dets > 0.0) & (defects <= ROTATION_TOLERANCE), bool)
 
 
 def _read_rig(path: Path, streams: list[FileImages]) -> Rig:

@@ -14,7 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam_graph.arrays import FloatArray, IntArray
-from slam_graph.datasets.streams.images import Fault, FileImages, decoded
+from slam_graph.datasets.streams.image_files import decode_image
+from slam_graph.datasets.streams.images import Fault, FileImages
 from slam_graph.datasets.streams.pairing import ABSENT
 from slam_graph.errors import DataError
 from slam_graph.sensors import Camera, DepthSensor, Rig
@@ -40,8 +41,8 @@ and some more, as points on a slanted surface are farther apart."""
 _MOST_PIXELS = 2e8
 """Most pixels of the camera that an image of the depth sensor is spread over, one by one."""
 _LARGEST_RATIO = 32.0
-"""Largest focal length of the camera over that of the depth sensor: each point fills as many pixels
-squared, one after the other."""
+"""Largest ratio of the camera's focal length to the depth sensor's. Each depth fills that number
+squared of pixels, in a loop."""
 _LARGEST_CAMERA = 2**25
 """Most pixels of a camera that depth is registered to; its images may be missing, so that nothing
 else tells that its calibrated size is wrong."""
@@ -221,7 +222,7 @@ def decode_depth(data: bytes, where: str) -> NDArray[Any] | Fault:
     Returns:
         (height, width) uint16 or float32, or a fault of kind `depth_unreadable`.
     """
-    image = decoded(data, cv2.IMREAD_UNCHANGED)
+    image = decode_image(data, cv2.IMREAD_UNCHANGED)
     if isinstance(image, str):
         return Fault("depth_unreadable", f"{where}: {image}")
     if image.ndim != 2 or image.dtype not in (np.uint16, np.float32):

@@ -4,20 +4,19 @@
 
 from __future__ import annotations
 
-import zlib
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from slam_graph.arrays import IntArray
-from slam_graph.datasets.streams.image_files import JPEG_SIGNATURE, PNG_SIGNATURE, decode_image
+from slam_graph.datasets.streams.image_files import decode_image
 from slam_graph.errors import DataError
 
 T = TypeVar("T")
@@ -27,8 +26,6 @@ _LONGEST_NAME = 250
 
 Image = NDArray[np.uint8]
 """(height, width), grey."""
-
-JPEG_END = b"\xff\xd9"
 
 _FRAMES_AHEAD = 3
 """Frames decoded ahead: enough to hide the time of decoding, few enough to save memory."""
@@ -112,48 +109,10 @@ def decode_grey(data: bytes, where: str) -> Image | Fault:
     Returns:
         (height, width) uint8, or a fault of kind `image_unreadable`.
     """
-    image = decoded(data, cv2.IMREAD_GRAYSCALE)
+    image = decode_image(data, cv2.IMREAD_GRAYSCALE)
     if isinstance(image, str):
         return Fault("image_unreadable", f"{where}: {image}")
     return image.astype(np.uint8, copy=False)
-
-
-def decoded(data: bytes, flags: int) -> NDArray[Any] | str:
-    """The image in the bytes of a file, or what is wrong with them.
-
-    Args:
-        data: bytes of the file.
-        flags: OpenCV's, of `cv2.imdecode`.
-    """
-    damage = find_damage(data)
-    return decode_image(data, flags) if damage is None else damage
-
-
-def find_damage(data: bytes) -> str | None:
-    """What is wrong with the bytes of an image file, as far as is known without decoding it."""
-    if not data:
-        return "empty file"
-    if data.startswith(PNG_SIGNATURE):
-        return _find_png_damage(data)
-    if data.startswith(JPEG_SIGNATURE) and JPEG_END not in data[-1024:]:
-        return "truncated JPEG"
-    return None
-
-
-def _find_png_damage(data: bytes) -> str | None:
-    """Compare the checksums of the chunks of a PNG file (0.1 ms for EuRoC's)."""
-    view = memoryview(data)
-    position = len(PNG_SIGNATURE)
-    while position + 12 <= len(data):
-        end = position + 12 + int.from_bytes(view[position : position + 4], "big")
-        if end > len(data):
-            break
-        if zlib.crc32(view[position + 4 : end - 4]) != int.from_bytes(view[end - 4 : end], "big"):
-            return f"damaged PNG (checksum at byte {position})"
-        if data[position + 4 : position + 8] == b"IEND":
-            return None
-        position = end
-    return "truncated PNG"
 
 
 def prefetch(

@@ -50,8 +50,8 @@ def read_object_truth(path: Path) -> dict[int, Trajectory]:
     blocks = [rows.parse(_COLUMNS, "true pose of an object") for rows in read_rows(path)]
     table = np.concatenate(blocks) if blocks else np.zeros(0, np.dtype(_COLUMNS))
     lengths = lengths_of(table["q"])
-    near = Files.are_measurable(table["position"]).all() and np.isfinite(lengths).all()
-    if not near or np.any(np.abs(lengths - 1.0) > _UNIT_TOLERANCE):
+    measurable = Files.are_measurable(table["position"]).all() and np.isfinite(lengths).all()
+    if not measurable or np.any(np.abs(lengths - 1.0) > _UNIT_TOLERANCE):
         raise DataError(
             f"{path}: a pose is not finite or too far, or a quaternion is not of unit length"
         )
