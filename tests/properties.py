@@ -170,6 +170,11 @@ def rows_of(
     return st.builds(lambda found, end: end.join(found), lines, LINE_ENDS)
 
 
+def rows_as_bytes(separator: str, columns: int) -> st.SearchStrategy[bytes]:
+    """The same as the bytes of a file."""
+    return rows_of(separator, columns).map(lambda text: text.encode("utf-8", "surrogatepass"))
+
+
 LINE_ENDS = st.sampled_from(["\n", "\n", "\r\n"])
 
 ANYTHING = st.one_of(

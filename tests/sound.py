@@ -2,13 +2,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """What must hold of all that was read, from a damaged file too: finite values, times in order."""
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from damage import CAMPAIGN
+from properties import LARGEST_STAMP_NS
 
 from slam_graph.bundle_adjustment.bal_problem import BalProblem
-from slam_graph.datasets import RecordedSequence
+from slam_graph.datasets import RecordedSequence, open_dataset
 from slam_graph.datasets.streams.mask_images import LARGEST_LABEL
 from slam_graph.geometry import NavState, Trajectory
 from slam_graph.maps.map_model import NO_FEATURE, SlamMap
@@ -23,8 +25,12 @@ from slam_graph.sensors import (
     Rig,
 )
 
-LARGEST_NS = 2**62
-"""Times beyond would make differences that do not fit."""
+
+def sound_dataset(path: Path, **options: Any) -> None:
+    """Everything that a run reads of the recording in a file or folder."""
+    sequence = open_dataset(path, **options)
+    assert isinstance(sequence, RecordedSequence)
+    sound_recording(sequence)
 
 
 def sound_recording(sequence: RecordedSequence) -> None:
@@ -66,7 +72,7 @@ def sound_stamps(*series: np.ndarray) -> None:
     for stamps in series:
         assert stamps.dtype == np.int64
         assert np.all(stamps[1:] > stamps[:-1])
-        assert np.all((stamps > -LARGEST_NS) & (stamps < LARGEST_NS))
+        assert np.all((stamps > -LARGEST_STAMP_NS) & (stamps < LARGEST_STAMP_NS))
 
 
 def sound_state(state: NavState) -> None:
@@ -178,7 +184,7 @@ def sound_rig(rig: Rig) -> None:
     for mounted in rig.cameras:
         sound_camera(mounted.camera)
         assert np.isfinite(mounted.body_T_camera.matrix() ** 2).all()
-        assert abs(mounted.time_offset_s) * 1e9 < LARGEST_NS
+        assert abs(mounted.time_offset_s) * 1e9 < LARGEST_STAMP_NS
         assert np.isfinite(mounted.readout_s)
     if rig.depth is not None:
         sensor = rig.depth

@@ -2,13 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Small valid files, damaged in many ways: each gives one line of ours, or is read."""
 
-import logging
 import shutil
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
 from textwrap import indent
-from typing import Any
 
 import cv2
 import numpy as np
@@ -31,10 +29,10 @@ from recordings_public import as_tum_vi, write_kitti_odometry, write_kitti_raw, 
 from recordings_ros import BagWriter, write_bag
 from sound import (
     sound_aiding,
+    sound_dataset,
     sound_graph,
     sound_map,
     sound_problem,
-    sound_recording,
     sound_rig,
     sound_table,
     sound_trajectory,
@@ -42,7 +40,7 @@ from sound import (
 
 from slam_graph.bundle_adjustment.bal_file import read_bal
 from slam_graph.config import load_config
-from slam_graph.datasets import TrackRecorder, open_dataset
+from slam_graph.datasets import TrackRecorder
 from slam_graph.datasets.calibration.kalibr_calibration import read_kalibr, write_kalibr
 from slam_graph.datasets.formats.eqvio import wheel_tracks
 from slam_graph.datasets.groundtruth import read_groundtruth
@@ -56,23 +54,15 @@ from slam_graph.results.map_output import load_map, save_map
 from slam_graph.sensors import FeatureFrame
 from slam_graph.simulation.simulator import simulate
 
-pytestmark = pytest.mark.filterwarnings("error::RuntimeWarning")
-
-
-@pytest.fixture(autouse=True)
-def quiet(caplog: pytest.LogCaptureFixture) -> None:
-    """What is dropped and counted is not written down for each of the many files."""
-    caplog.set_level(logging.CRITICAL, logger="slam_graph")
+pytestmark = [
+    pytest.mark.filterwarnings("error::RuntimeWarning"),
+    pytest.mark.usefixtures("quiet"),
+]
 
 
 def shorten(path: Path, lines: int) -> None:
     """Keep the first lines of a file."""
     path.write_text("".join(path.read_text().splitlines(keepends=True)[:lines]))
-
-
-def read_all(path: Path, **options: Any) -> None:
-    """Everything that a run reads of a recording, which is sound."""
-    sound_recording(open_dataset(path, **options))
 
 
 TRUTH = "state_groundtruth_estimate0"
@@ -97,7 +87,7 @@ def test_euroc(tmp_path: Path, name: str) -> None:
         write_groundtruth(root / "mav0", 16, 8)
         tracked = CAMERA_YAML.format(y=0.1) if name.endswith("yaml") else IMU_YAML
         (root / "mav0" / TRUTH / "sensor.yaml").write_text(tracked)
-    tried(root / "mav0" / name, lambda: read_all(root))
+    tried(root / "mav0" / name, lambda: sound_dataset(root))
 
 
 def with_depth(mav0: Path) -> None:
@@ -116,7 +106,7 @@ def with_depth(mav0: Path) -> None:
 @pytest.mark.parametrize("name", ["camchain.yaml", "imu_config.yaml"])
 def test_tum_vi(tmp_path: Path, name: str) -> None:
     root = as_tum_vi(write_euroc(tmp_path / "flight", frames=2, cameras=1, imu_lead=4))
-    tried(root / "dso" / name, lambda: read_all(root))
+    tried(root / "dso" / name, lambda: sound_dataset(root))
 
 
 def test_kalibr(tmp_path: Path) -> None:
@@ -223,7 +213,7 @@ def tracks(tmp_path_factory: pytest.TempPathFactory) -> Path:
 )
 def test_recordings(tracks: Path, tmp_path: Path, name: str) -> None:
     folder = shutil.copytree(tracks, tmp_path / "flight")
-    tried(folder / name, lambda: read_all(folder))
+    tried(folder / name, lambda: sound_dataset(folder))
 
 
 @pytest.mark.parametrize("name", ["labels.bin", "moving.bin", "moving_frames.bin"])
@@ -234,7 +224,7 @@ def test_recordings_of_objects(tmp_path: Path, name: str) -> None:
         for packet in flight.packets():
             assert isinstance(packet.frame, FeatureFrame)
             recorder.write(packet.imu, replace(packet.frame, moving=packet.frame.cameras))
-    tried(folder / name, lambda: read_all(folder))
+    tried(folder / name, lambda: sound_dataset(folder))
 
 
 @pytest.mark.parametrize(
@@ -243,14 +233,14 @@ def test_recordings_of_objects(tmp_path: Path, name: str) -> None:
 def test_openvins(tmp_path: Path, name: str) -> None:
     folder = write_openvins(tmp_path / "flight", frames=3, features=4, cameras=1)
     shorten(folder / "imu.csv", 70)
-    tried(folder / name, lambda: read_all(folder))
+    tried(folder / name, lambda: sound_dataset(folder))
 
 
 def test_eqvio(tmp_path: Path) -> None:
     path = tmp_path / "tracks.csv"
     with wheel_tracks().open(encoding="utf-8") as whole:
         path.write_text("".join(islice(whole, 120)), encoding="utf-8")
-    tried(path, lambda: read_all(path))
+    tried(path, lambda: sound_dataset(path))
 
 
 @pytest.mark.parametrize("name", ["rgb.txt", "depth.txt"])
@@ -258,7 +248,7 @@ def test_tum_rgbd(tmp_path: Path, name: str) -> None:
     folder = write_tum_rgbd(tmp_path / "flight_freiburg1", frames=3, size=SIZE)
     chain = tmp_path / "chain.yaml"
     chain.write_text(CHAIN)
-    tried(folder / name, lambda: read_all(folder, calibration=chain))
+    tried(folder / name, lambda: sound_dataset(folder, calibration=chain))
 
 
 @pytest.mark.parametrize(
@@ -271,20 +261,20 @@ def test_tum_rgbd(tmp_path: Path, name: str) -> None:
 def test_kitti(tmp_path: Path, name: str) -> None:
     folder = write_kitti_raw(tmp_path / "2011_09_26", frames=2)
     file = next(iter(sorted((tmp_path / "2011_09_26").rglob(name))))
-    tried(file, lambda: read_all(folder))
+    tried(file, lambda: sound_dataset(folder))
 
 
 @pytest.mark.parametrize("name", ["calib.txt", "times.txt", "03.txt"])
 def test_kitti_odometry(tmp_path: Path, name: str) -> None:
     folder = write_kitti_odometry(tmp_path, frames=3)
-    tried(next(tmp_path.rglob(name)), lambda: read_all(folder))
+    tried(next(tmp_path.rglob(name)), lambda: sound_dataset(folder))
 
 
 @pytest.mark.parametrize("name", ["timestamps.csv", "imu.csv", "calibration.yaml"])
 def test_image_folder(tmp_path: Path, name: str) -> None:
     folder = write_image_folder(tmp_path / "flight", count=3)
     shorten(folder / "imu.csv", 50)
-    tried(folder / name, lambda: read_all(folder))
+    tried(folder / name, lambda: sound_dataset(folder))
 
 
 def test_masks(tmp_path: Path) -> None:
@@ -420,18 +410,18 @@ NAMED = {"groundtruth": "/truth", "poses": "/pose", "odometry": "/odometry"}
 def test_bags(tmp_path: Path, kind: str, packed: str) -> None:
     path = write_bag(tmp_path, kind, extra=everything, packed=packed, **SMALL)
     file = path if path.is_file() else next(path.glob("*.db3"))
-    tried(file, lambda: read_all(file, sources=NAMED))
+    tried(file, lambda: sound_dataset(file, sources=NAMED))
 
 
 @pytest.mark.parametrize("packed", ["file", "message"])
 def test_bags_packed_by_zstd(tmp_path: Path, packed: str) -> None:
     path = write_bag(tmp_path, "sqlite", cameras=1, packed=packed, **SMALL)
-    tried(next(path.glob("*.db3*")), lambda: read_all(path))
+    tried(next(path.glob("*.db3*")), lambda: sound_dataset(path))
 
 
 def test_metadata_of_bags(tmp_path: Path) -> None:
     path = write_bag(tmp_path, "mcap", cameras=1, **SMALL)
-    tried(path / "metadata.yaml", lambda: read_all(path))
+    tried(path / "metadata.yaml", lambda: sound_dataset(path))
 
 
 SHADES = [np.full((48, 64), shade, np.uint8) for shade in (40, 90, 160)]
@@ -444,11 +434,11 @@ SHADES = [np.full((48, 64), shade, np.uint8) for shade in (40, 90, 160)]
 )
 def test_videos(tmp_path: Path, name: str, codec: str) -> None:
     path = write_video(tmp_path, name, codec, SHADES)
-    tried(path, lambda: read_all(path))
+    tried(path, lambda: sound_dataset(path))
 
 
 @pytest.mark.parametrize("name", ["flight.csv", "flight.imu.csv", "flight.yaml"])
 def test_what_lies_beside_a_video(tmp_path: Path, name: str) -> None:
     path = write_flight_video(tmp_path, SHADES)
     shorten(path.with_suffix(".imu.csv"), 50)
-    tried(tmp_path / name, lambda: read_all(path))
+    tried(tmp_path / name, lambda: sound_dataset(path))

@@ -7,7 +7,6 @@ there is nothing.
 """
 
 import itertools
-import logging
 from pathlib import Path
 from typing import Any
 
@@ -23,16 +22,13 @@ from slam_graph.pose_graph import PoseGraphPolicy, certify, optimize_pose_graph,
 from slam_graph.pose_graph.graph_files import g2o_lines
 from slam_graph.results import BalResult, PoseGraphResult
 
-pytestmark = pytest.mark.filterwarnings("error::RuntimeWarning")
+pytestmark = [
+    pytest.mark.filterwarnings("error::RuntimeWarning"),
+    pytest.mark.usefixtures("quiet"),
+]
 
 IN_CI = 8
 """Ways in which a file is damaged, for each method."""
-
-
-@pytest.fixture(autouse=True)
-def quiet(caplog: pytest.LogCaptureFixture) -> None:
-    """What is dropped and counted is not written down for each of the many files."""
-    caplog.set_level(logging.CRITICAL, logger="slam_graph")
 
 
 def solve_graph(path: Path, policy: PoseGraphPolicy, others: dict[str, Any]) -> None:

@@ -6,7 +6,6 @@
 """
 
 import json
-import logging
 import shutil
 from pathlib import Path
 from typing import Any
@@ -28,16 +27,13 @@ from slam_graph.results import SavedRun
 from slam_graph.results.map_output import read_ply
 from slam_graph.results.result_files import read_table
 
-pytestmark = pytest.mark.filterwarnings("error::RuntimeWarning")
+pytestmark = [
+    pytest.mark.filterwarnings("error::RuntimeWarning"),
+    pytest.mark.usefixtures("quiet"),
+]
 
 FRAMES = 5
 """Tables are cut to so many rows: damage then meets what is special more often."""
-
-
-@pytest.fixture(autouse=True)
-def quiet(caplog: pytest.LogCaptureFixture) -> None:
-    """What is dropped and counted is not written down for each of the many files."""
-    caplog.set_level(logging.CRITICAL, logger="slam_graph")
 
 
 @pytest.fixture(scope="module")

@@ -6,7 +6,6 @@ A calibration that is read (`test_damaged_files`) may be that of other sensors, 
 any amount.
 """
 
-import logging
 import shutil
 import time
 from dataclasses import astuple, replace
@@ -29,7 +28,10 @@ from slam_graph.results import SavedRun
 from slam_graph.sensors import ImuNoise, Rig
 from slam_graph.simulation.simulator import simulate
 
-pytestmark = pytest.mark.filterwarnings("error::RuntimeWarning")
+pytestmark = [
+    pytest.mark.filterwarnings("error::RuntimeWarning"),
+    pytest.mark.usefixtures("quiet"),
+]
 
 IN_CI = 3
 """Ways in which a calibration is damaged, for each algorithm."""
@@ -38,12 +40,6 @@ MOST_S = 20.0
 """CPU that no run of two seconds may take."""
 
 ALGORITHMS = ("msckf", "swf", "okvis", "ekf", "fixed_lag_isam2")
-
-
-@pytest.fixture(autouse=True)
-def quiet(caplog: pytest.LogCaptureFixture) -> None:
-    """What runs say of wrong calibrations is not written down for each of them."""
-    caplog.set_level(logging.CRITICAL, logger="slam_graph")
 
 
 @pytest.fixture(scope="module")

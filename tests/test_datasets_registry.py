@@ -192,3 +192,12 @@ def test_recordings_pass_their_checks(data_dir: Path) -> None:
         "euroc_inertial/V2_02_medium",
     ):
         assert found(data_dir / name)["error"] == []
+
+
+def test_numbers_of_other_scripts_are_refused(tmp_path: Path) -> None:
+    """NumPy looks them up in a table of 256 characters: a crash in one of some runs."""
+    path = tmp_path / "flight.csv"
+    for wrong in ("\U0010ffff", "1\U0001f6f0", "١٢"):
+        path.write_text(f"1,0,0,0,1,0,0,0\n{wrong},0,0,0,1,0,0,0\n", encoding="utf-8")
+        with pytest.raises(DataError, match=r"flight\.csv:2: "):
+            read_groundtruth(path)

@@ -9,7 +9,6 @@ import shutil
 import struct
 import zlib
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -26,13 +25,13 @@ from properties import (
     in_seconds,
     instead,
     parsed,
-    rows_of,
+    rows_as_bytes,
     stamps,
 )
 from recordings import SIZE
 from recordings_loose import CHAIN, write_flight_video, write_image_folder
 from recordings_public import write_tum_rgbd
-from sound import sound_recording, sound_stamps
+from sound import sound_dataset, sound_recording, sound_stamps
 
 from slam_graph.datasets import RecordedSequence, open_dataset
 from slam_graph.datasets.formats.image_folder import read_stamps, stamps_from_names
@@ -43,12 +42,6 @@ pytestmark = [
     pytest.mark.filterwarnings("error::RuntimeWarning"),
     pytest.mark.usefixtures("quiet"),
 ]
-
-
-def check_recording(path: Path, **options: Any) -> None:
-    sequence = open_dataset(path, **options)
-    assert isinstance(sequence, RecordedSequence)
-    sound_recording(sequence)
 
 
 # --- files of images ------------------------------------------------------------------------------
@@ -269,9 +262,9 @@ def test_folders_of_images(images: Path, data: st.DataObject) -> None:
 @given(data=st.data())
 def test_edited_files_of_a_folder(images: Path, name: str, data: st.DataObject) -> None:
     file = images / name
-    rows = rows_of(",", 2).map(lambda text: text.encode("utf-8", "surrogatepass"))
+    rows = rows_as_bytes(",", 2)
     with instead(file, data.draw(edited(file.read_text(), " ,:[]") | rows)):
-        parsed(check_recording, images)
+        parsed(sound_dataset, images)
 
 
 @pytest.mark.parametrize("suffix", [".csv", ".imu.csv", ".yaml"])
@@ -280,7 +273,7 @@ def test_edited_files_of_a_folder(images: Path, name: str, data: st.DataObject) 
 def test_edited_files_beside_a_video(video: Path, suffix: str, data: st.DataObject) -> None:
     file = video.with_suffix(suffix)
     with instead(file, data.draw(edited(file.read_text(), " ,:[]") | ANYTHING)):
-        parsed(check_recording, video)
+        parsed(sound_dataset, video)
 
 
 @examples(25)
@@ -289,7 +282,7 @@ def test_anything_as_a_video(video: Path, data: st.DataObject) -> None:
     whole = video.read_bytes()
     kept = data.draw(st.integers(0, len(whole)))
     with instead(video, whole[:kept] + data.draw(ANYTHING)):
-        parsed(check_recording, video)
+        parsed(sound_dataset, video)
 
 
 @examples(25)
@@ -318,9 +311,9 @@ def test_rgbd(rgbd: tuple[Path, Path], data: st.DataObject) -> None:
 def test_edited_lists(rgbd: tuple[Path, Path], name: str, data: st.DataObject) -> None:
     folder, chain = rgbd
     file = folder / name
-    rows = rows_of(" ", 2).map(lambda text: text.encode("utf-8", "surrogatepass"))
+    rows = rows_as_bytes(" ", 2)
     with instead(file, data.draw(edited(file.read_text(), " /") | rows)):
-        parsed(lambda: check_recording(folder, calibration=chain))
+        parsed(lambda: sound_dataset(folder, calibration=chain))
 
 
 def test_a_list_names_files_of_the_recording_only(rgbd: tuple[Path, Path], tmp_path: Path) -> None:

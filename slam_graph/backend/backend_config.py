@@ -53,7 +53,7 @@ class NoiseConfig(Settings):
     it is smaller, down to a quarter; covariances are then more often too small. never: take
     `pixel_sigma`, as GTSAM's smoothers always do."""
     drift_px: float = expert(0.0, ge=0)
-    """How far tracks slide off their points in one frame, in pixels along each axis: √n times as
+    """How far tracks drift off their points in one frame, in pixels along each axis: √n times as
     far in n frames. It is process noise of the features in the state."""
     adaptive_drift: bool = expert(default=True)
     """Estimate `drift_px` from the residuals of tracks; the setting is then what holds until they

@@ -57,7 +57,7 @@ class CostPolicy(Settings):
     keep_lost_features: bool | None = None
     """Whether features of the state that are no longer tracked are kept for when they come back:
     for front ends and simulations that recognise features. Not given: with stereo and RGB-D without
-    an IMU only."""
+    an IMU only. Once tracks drift (`backend.noise.adaptive_drift`), none are kept."""
     max_state_features: int | None = Field(40, ge=0)
     """How many features are held in the state while they are tracked; null for no bound, 0 for the
     textbook MSCKF. Long-lived features in the state lower the drift and cost time."""
