@@ -14,6 +14,7 @@ from scipy.stats import chi2, kstest
 
 from slam_graph.arrays import FloatArray
 from slam_graph.backend.backend_config import BackendConfig, GatingConfig, NoiseConfig
+from slam_graph.backend.cost.consensus_gate import gate_by_consensus
 from slam_graph.backend.cost.cost import Cost, Linearization, TrackFeatures
 from slam_graph.backend.cost.feature_factors import WhitenedObservations
 from slam_graph.backend.cost.feature_tracks import Observations
@@ -240,3 +241,45 @@ def test_the_joint_distance_is_what_measurements_add_to_the_least_cost() -> None
     r = b - A @ predicted.solution()
     expected = r @ np.linalg.solve(A @ predicted.covariance() @ A.T + np.eye(7), r)
     assert posterior.residual - predicted.residual == pytest.approx(expected)
+
+
+def seen_by_a_lost_camera(
+    rng: np.random.Generator, shift_px: float
+) -> tuple[Cost, SquareRootInformation, np.ndarray]:
+    """Features of the state in one frame whose pose is hardly known, every seventh of them moved.
+
+    Returns:
+        The cost, what is known before, and which observations (N,) are of features that moved.
+    """
+    times = np.array([rng.uniform(0.0, 20.0)])
+    obs, truth = scene(Flight(), CAMERAS, room(300, rng), times, rng, SIGMA_PX, 1)
+    both = obs.subset(obs.counts == 2)
+    moved = both.feature % 7 == 0
+    both.pixels[moved, 0] += shift_px
+    state = State()
+    pose = gtsam.Pose3(gtsam.Rot3(truth.rotations[0]), truth.positions[0])
+    zeros = {name: np.zeros(3) for name in ("velocity", "accel_bias", "gyro_bias")}
+    state.insert_imu_state(0, NavState(0, pose, **zeros))
+    sigma_m = 0.005
+    for j, point in zip(both.ids.tolist(), truth.points[obs.counts == 2], strict=True):
+        state.insert_point(j, point + rng.normal(0.0, sigma_m, 3))
+    layout = Layout(dims_of([X(0), *(L(j) for j in both.ids.tolist())]))
+    sigmas = np.full(layout.size, sigma_m)
+    sigmas[:6] = np.repeat([0.2, 0.5], 3)
+    cost = Cost(state, PROJECTION, CONFIG, SquareRootInformation.empty())
+    cost.landmarks = both
+    return cost, known(np.diag(sigmas**2), layout), moved
+
+
+def test_what_moves_passes_a_vague_prediction_but_not_the_consensus() -> None:
+    rng = np.random.default_rng(23)
+    for _ in range(5):
+        cost, predicted, moved = seen_by_a_lost_camera(rng, 8.0 * SIGMA_PX)
+        linear = cost.linearize()
+        plain, found = (f(cost, linear, predicted) for f in (Cost.gate, gate_by_consensus))
+        assert np.sum(moved) >= 6
+        assert plain.landmarks.all()
+        assert np.mean(found.landmarks[moved]) < 0.1
+        assert np.mean(found.landmarks[~moved]) > 0.97
+        assert found.innovations.passed_dof == 2 * np.sum(found.landmarks)
+        assert found.innovations.rejected == np.sum(~found.landmarks)

@@ -134,12 +134,12 @@ def test_results_of_a_comparison(result: sg.RunResult, tmp_path: Path) -> None:
     tried(path, lambda: _cells(_row("flight", "msckf", [Done(path)])))  # type: ignore[list-item]
 
 
-COMPARED: dict[str, tuple[list[str], object]] = {
-    "no steps": (["mean_steps"], ...),
-    "no alignment": (["metrics", "extent", "unmeasured"], ...),
-    "steps without end": (["mean_steps"], 10**400),
-    "a number that is none": (["metrics", "nees"], {"pose": {"mean": 10**400}}),
-    "nothing expected": (["metrics", "nis"], {"mean": 1.0, "expected_mean": 0.0}),
+COMPARED: dict[str, tuple[list[str], object, bool]] = {
+    "no steps": (["mean_steps"], ..., False),
+    "no alignment": (["metrics", "extent", "unmeasured"], ..., False),
+    "steps without end": (["mean_steps"], 10**400, False),
+    "a number that is none": (["metrics", "nees"], {"pose": {"mean": 10**400}}, True),
+    "nothing expected": (["metrics", "nis"], {"mean": 1.0, "expected_mean": 0.0}, True),
 }
 
 
@@ -150,7 +150,7 @@ def test_a_comparison_is_done_again_or_has_a_row(
     path = tmp_path / "msckf.json"
     about = {"data": "flight", "algorithm": "msckf", "seed": 0, "settings_hash": "1"}
     write_result(path, result, about)
-    keys, value = COMPARED[fault]
+    keys, value, done = COMPARED[fault]
     table = whole = json.loads(path.read_text())
     for key in keys[:-1]:
         table = table[key]
@@ -158,6 +158,7 @@ def test_a_comparison_is_done_again_or_has_a_row(
     if value is ...:
         del table[keys[-1]]
     path.write_text(json.dumps(whole))
+    assert Done(path).is_done() == done
     assert _cells(_row("flight", "msckf", [Done(path)]))  # type: ignore[list-item]
 
 
