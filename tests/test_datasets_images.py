@@ -12,8 +12,8 @@ import pytest
 from recordings import FRAME_PERIOD_NS, START_NS, write_euroc
 
 from slam_graph.datasets.formats.euroc import EurocSequence
-from slam_graph.datasets.streams.image_files import find_damage
 from slam_graph.datasets.streams.images import prefetch
+from slam_graph.image_files import find_damage
 from slam_graph.sensors.measurements import CameraFrame
 
 

@@ -13,7 +13,7 @@ PACKAGE = Path(slam_graph.__file__).parent
 
 LAYERS = (
     {"errors", "diagnostics", "version", "arrays", "lazy", "interrupts"},
-    {"files", "kernels", "plugins", "display"},
+    {"files", "image_files", "kernels", "plugins", "display"},
     {"settings", "geometry"},
     {"sensors"},
     {"datasets", "frontend"},

@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-import struct
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,6 +15,7 @@ from slam_graph.errors import ConfigError
 from slam_graph.frontend.detectors import refine
 from slam_graph.frontend.frontend_config import DETECTORS, FrontendConfig
 from slam_graph.frontend.keypoints import Image, Keypoints, Pixels, spread
+from slam_graph.image_files import decode_image
 from slam_graph.kernels.spacing import claim, clear_disks
 from slam_graph.sensors import Camera
 
@@ -286,42 +286,22 @@ def camera_mask(camera: Camera, path: Path | None, window_px: int) -> Image | No
     return inside if mask is None else np.minimum(mask, inside)
 
 
-_PNG = b"\x89PNG\r\n\x1a\n"
-
-
 def _read_mask(path: Path, width: int, height: int) -> Image:
     """Read the mask of a camera.
 
     Raises:
         ConfigError: if it is missing, unreadable, or not of the size of the camera's images.
     """
-    data = path.read_bytes() if path.is_file() else b""
-    if data.startswith(_PNG):  # memory is taken for what it claims
-        if _is_damaged_png(data):
-            raise ConfigError(f"{path}: the mask of a camera is a damaged PNG; take another copy")
-        claimed = struct.unpack(">II", data[16:24])
-        if claimed != (width, height):
-            raise ConfigError(
-                f"{path}: the mask is {claimed[0]}x{claimed[1]}, "
-                f"the camera's images are {width}x{height}"
-            )
-    try:
-        image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) if path.is_file() else None
-    except cv2.error:  # it claims more pixels than OpenCV takes
-        image = None
-    if image is None:
-        raise ConfigError(f"{path}: the mask of a camera is missing or not a readable image")
+    if not path.is_file():
+        raise ConfigError(f"{path}: the mask of a camera is missing")
+    image = decode_image(path.read_bytes(), cv2.IMREAD_GRAYSCALE)
+    if isinstance(image, str):
+        raise ConfigError(
+            f"{path}: the mask of a camera cannot be read ({image}); take another copy"
+        )
     if image.shape != (height, width):
         raise ConfigError(
             f"{path}: the mask is {image.shape[1]}x{image.shape[0]}, "
             f"the camera's images are {width}x{height}"
         )
     return np.asarray(image, np.uint8)
-
-
-def _is_damaged_png(data: bytes) -> bool:
-    """Whether a PNG does not begin with its header, or a part of it is longer than the file."""
-    position = len(_PNG)
-    while data[position + 4 : position + 8] not in (b"IEND", b""):
-        position += 12 + int.from_bytes(data[position : position + 4], "big")
-    return position + 12 > len(data) or data[12:16] != b"IHDR"

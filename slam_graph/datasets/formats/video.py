@@ -24,7 +24,6 @@ from slam_graph.datasets.formats.image_folder import (
     regular_stamps,
 )
 from slam_graph.datasets.sequence import FrameStream, ReaderOptions
-from slam_graph.datasets.streams.image_files import fault_of_claim
 from slam_graph.datasets.streams.image_sequence import (
     LOOKED_AT,
     GroupedSequence,
@@ -34,6 +33,7 @@ from slam_graph.datasets.streams.image_sequence import (
 from slam_graph.datasets.streams.images import Fault, Image, prefetch
 from slam_graph.datasets.streams.pairing import Groups, group_by_time, in_order
 from slam_graph.errors import DataError
+from slam_graph.image_files import fault_of_claim
 from slam_graph.sensors import CameraFrame
 
 SUFFIXES = {".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v", ".mpg", ".mpeg", ".mjpeg", ".h264"}

@@ -14,10 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam_graph.arrays import FloatArray, IntArray
-from slam_graph.datasets.streams.image_files import decode_image
 from slam_graph.datasets.streams.images import Fault, FileImages
 from slam_graph.datasets.streams.pairing import ABSENT
 from slam_graph.errors import DataError
+from slam_graph.image_files import decode_image
 from slam_graph.sensors import Camera, DepthSensor, Rig
 
 DEPTH_TOLERANCE_S = 0.02

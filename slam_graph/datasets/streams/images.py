@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam_graph.arrays import IntArray
-from slam_graph.datasets.streams.image_files import decode_image
 from slam_graph.errors import DataError
+from slam_graph.image_files import decode_image
 
 T = TypeVar("T")
 

@@ -22,9 +22,9 @@ from numpy.typing import NDArray
 
 from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.datasets.streams.csv_rows import check_times, read_rows
-from slam_graph.datasets.streams.image_files import decode_image
 from slam_graph.errors import DataError
 from slam_graph.files import Files
+from slam_graph.image_files import decode_image
 
 MASKS = "masks"
 """Name of the folder beside a recording."""
