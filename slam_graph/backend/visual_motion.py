@@ -9,17 +9,22 @@ it, and one Gauss-Newton step from there ends beside the minimum. So the new pos
 PnP from points that are known already: features of the estimator, and those whose depth the last
 frame has by a second camera or a depth sensor. It is the point at which the new state is
 linearised, not a measurement: its images still come, and count once.
+
+The motion that is found is that of most features. So far features count as well, although two
+cameras hardly tell their depth: the motion between two frames moves them by no more than the error
+of their disparity in the image, where it is shorter than the baseline. Without them a moving object
+that is near has half of the points.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from slam_graph.arrays import FloatArray, IntArray
+from slam_graph.arrays import BoolArray, FloatArray, IntArray
 from slam_graph.backend.cost.feature_tracks import is_in
 from slam_graph.backend.cost.triangulation import triangulate_frames
 from slam_graph.geometry import NavState
@@ -27,12 +32,50 @@ from slam_graph.sensors import FeatureFrame, Rig, RigCamera
 
 ERROR_PX = 4.0
 """Largest error of a point that fits the motion."""
+_ERRORS_PX, _SHARES = (1.5, 2.5, ERROR_PX), (0.65, 0.65, 0.5)
+"""Limits of the errors, which are tried in turn, and the part of the points that must fit: what
+moves slowly, or is near, would fit a motion between its own and that of the platform."""
+_NEAREST_M, _FAR_M = 0.1, 75.0
+"""Two cameras that see no parallax tell a direction: the feature is taken to be far away."""
 _SAME_NS = 5_000_000
 """The last frame is used if the time since it is that since the last state, to so much."""
-_LEAST_SHARE = 0.5
-"""Part of the known points that must fit it."""
 _ROUNDS = 3
 """With a rolling shutter: its rows are undone with the rate that the round before has found."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class KnownPoints:
+    """Features and where they are.
+
+    Attributes:
+        ids: (N,).
+        points: (N, 3) m, in the frame that is said where it is made.
+        located: (N,) whether the depth is known; the others are so far away that only their
+            direction is.
+    """
+
+    ids: IntArray
+    points: FloatArray
+    located: BoolArray
+
+    def subset(self, rows: BoolArray | IntArray) -> KnownPoints:
+        """Some of them, by a mask or by indices."""
+        return KnownPoints(self.ids[rows], self.points[rows], self.located[rows])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PoseOfMost:
+    """A pose that most points agree on.
+
+    Attributes:
+        world_T_body: the pose.
+        fits: (N,) which points fit it.
+        limit_px: the largest error of these.
+    """
+
+    world_T_body: gtsam.Pose3
+    fits: BoolArray
+    limit_px: float
 
 
 class VisualMotion:
@@ -73,13 +116,14 @@ class VisualMotion:
         since_ns = predicted.stamp_ns - before.stamp_ns
         if last is not None and abs(frame.stamp_ns - last.stamp_ns - since_ns) > _SAME_NS:
             last = None  # it is not that of the state before
-        ids, points = self._known(before, last, known)
-        found = predicted
+        points = self._known(before, last, known)
+        found, limit_px = predicted, 0.0
         for _ in range(_ROUNDS if self._rig.rolling else 1):
-            pose = self._pose(frame, ids, points, self._rate(found, before))
-            if pose is None:
+            solved = self._pose(frame, points, self._rate(found, before), limit_px)
+            if solved is None:
                 return predicted
-            found = moved_to(before, predicted, pose, self._rig.has_imu)
+            limit_px = solved.limit_px
+            found = moved_to(before, predicted, solved.world_T_body, self._rig.has_imu)
         return found
 
     def _rate(self, state: NavState, before: NavState | None = None) -> FloatArray:
@@ -96,33 +140,50 @@ class VisualMotion:
 
     def _known(
         self, before: NavState, last: FeatureFrame | None, known: tuple[IntArray, FloatArray]
-    ) -> tuple[IntArray, FloatArray]:
-        """Known features, ascending ids, and those of the last frame with a depth."""
+    ) -> KnownPoints:
+        """Known features in the world, ascending ids, and those of the last frame."""
         ids, points = known
+        located = np.ones(len(ids), np.bool_)
         if last is not None:
-            seen, local = depths_within(last, self._rig, self._rate(before))
-            others = ~np.isin(seen, ids)
-            world = np.asarray(before.world_T_body.transformFrom(local[others].T)).T
-            ids = np.concatenate([ids, seen[others]])
+            seen = depths_within(last, self._rig, self._rate(before))
+            seen = seen.subset(~np.isin(seen.ids, ids))
+            world = np.asarray(before.world_T_body.transformFrom(seen.points.T)).T
+            ids = np.concatenate([ids, seen.ids])
             points = np.concatenate([points, world.reshape(-1, 3)])
-        order = np.argsort(ids)
-        return ids[order], points[order]
+            located = np.concatenate([located, seen.located])
+        return KnownPoints(ids, points, located).subset(np.argsort(ids))
 
     def _pose(
-        self, frame: FeatureFrame, ids: IntArray, points: FloatArray, rate: FloatArray
-    ) -> gtsam.Pose3 | None:
-        """world_T_body by known points (ascending ids); None if they do not tell it."""
+        self, frame: FeatureFrame, known: KnownPoints, rate: FloatArray, least_px: float
+    ) -> PoseOfMost | None:
+        """The pose by known points (ascending ids); None if they do not tell it."""
         seen, mounted = frame.cameras[0], self._rig.cameras[0]
-        rows = is_in(seen.ids, ids)
-        if np.count_nonzero(rows) < self._min_points:
+        rows = is_in(seen.ids, known.ids)
+        found = known.subset(np.searchsorted(known.ids, seen.ids[rows]))
+        if np.count_nonzero(found.located) < self._min_points:
             return None
-        world = points[np.searchsorted(ids, seen.ids[rows])]
         rays = _unrolled(seen.normalized[rows], seen.pixels[rows, 1], mounted, rate)
-        rays = rays[:, :2] / rays[:, 2:]
-        solved = mounted.body_pose(world, rays, ERROR_PX, tightened=True)
-        if solved is None or np.mean(solved[1]) < _LEAST_SHARE:
-            return None
-        return solved[0]
+        return pose_of_most(mounted, found.points, rays[:, :2] / rays[:, 2:], least_px)
+
+
+def pose_of_most(
+    mounted: RigCamera, points: FloatArray, rays: FloatArray, least_px: float = 0.0
+) -> PoseOfMost | None:
+    """The pose that most points agree on; None if fewer than half do.
+
+    Args:
+        mounted: the camera.
+        points: (N, 3) in the world, m.
+        rays: (N, 2) where it sees them, on its plane z = 1.
+        least_px: smaller limits of the errors are not tried.
+    """
+    for error_px, share in zip(_ERRORS_PX, _SHARES, strict=True):
+        if error_px < least_px:
+            continue
+        solved = mounted.body_pose(points, rays, error_px, tightened=True)
+        if solved is not None and np.mean(solved[1]) >= share:
+            return PoseOfMost(*solved, error_px)
+    return None
 
 
 def _unrolled(
@@ -144,10 +205,8 @@ def _unrolled(
     return np.asarray(Rotation.from_rotvec(seconds[:, None] * turn).apply(rays))
 
 
-def depths_within(
-    frame: FeatureFrame, rig: Rig, rate: FloatArray | None = None
-) -> tuple[IntArray, FloatArray]:
-    """Ids (N,) and positions (N, 3) in the body frame of features with a depth in one frame.
+def depths_within(frame: FeatureFrame, rig: Rig, rate: FloatArray | None = None) -> KnownPoints:
+    """Positions in the body frame of features that two cameras see, or one and a depth sensor.
 
     Args:
         frame: the frame.
@@ -155,16 +214,23 @@ def depths_within(
         rate: (3,) angular rate of the body, rad/s, by which rows of a rolling shutter differ; None
             for none.
     """
-    ids = frame.cameras[0].ids
-    if len(rig.cameras) < 2 or len(ids) == 0:
-        return np.zeros(0, np.int64), np.zeros((0, 3))
-    found = triangulate_frames(ids, [frame], np.eye(3)[None], np.zeros((1, 3)), rig)
-    ids, points, mounted = ids[found.good], found.points[found.good], rig.cameras[0]
+    seen, mounted = frame.cameras[0], rig.cameras[0]
+    if len(rig.cameras) < 2 or len(seen.ids) == 0:
+        return KnownPoints(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros(0, np.bool_))
+    found = triangulate_frames(seen.ids, [frame], np.eye(3)[None], np.zeros((1, 3)), rig)
+    twice = np.isfinite(found.depth_error)
+    rays = np.column_stack([seen.normalized, np.ones(len(twice))])[twice]
+    camera = mounted.body_T_camera
+    depths = np.asarray(camera.transformTo(found.points[twice].T))[2]
+    usable = found.good[twice] | ((depths > _NEAREST_M) & (depths < _FAR_M))
+    far = np.asarray(camera.transformFrom(_FAR_M * rays.T)).T
+    points = np.where(usable[:, None], found.points[twice], far)
+    known = KnownPoints(seen.ids[twice], points, found.good[twice])
     if rate is not None and mounted.readout_s != 0.0:
-        rows = frame.cameras[0].pixels[found.good, 1]
-        seconds = mounted.row_times_s(rows) - mounted.middle_s
-        points = Rotation.from_rotvec(seconds[:, None] * rate).apply(points)
-    return ids, points
+        seconds = mounted.row_times_s(seen.pixels[twice, 1]) - mounted.middle_s
+        turned = Rotation.from_rotvec(seconds[:, None] * rate).apply(known.points)
+        known = replace(known, points=turned)
+    return known
 
 
 def moved_to(

@@ -12,11 +12,12 @@ import gtsam
 import numpy as np
 
 from slam_graph.arrays import IntArray
+from slam_graph.backend.cost.feature_tracks import is_in
 from slam_graph.backend.dynamics import bias_covariance
 from slam_graph.backend.engine_protocol import EngineContext
 from slam_graph.backend.initialization.first_state import start_from
 from slam_graph.backend.initialization.start_diagnosis import Refusal
-from slam_graph.backend.visual_motion import ERROR_PX, depths_within
+from slam_graph.backend.visual_motion import depths_within, pose_of_most
 from slam_graph.backend.window import Window
 from slam_graph.geometry import NavState
 from slam_graph.sensors import FeatureFrame
@@ -89,20 +90,20 @@ class VisualStart:
     def _motion(self, before: FeatureFrame, now: FeatureFrame) -> gtsam.Pose3 | Refusal:
         """The motion before_T_now of the body, or what is missing for it."""
         rig, seen = self._context.rig, now.cameras[0]
-        ids, points = depths_within(before, rig)
-        rows = np.isin(seen.ids, ids)
-        count, least = np.count_nonzero(rows), self._context.config.dynamics.min_points
+        known = depths_within(before, rig)
+        known = known.subset(np.argsort(known.ids))
+        rows = is_in(seen.ids, known.ids)
+        found = known.subset(np.searchsorted(known.ids, seen.ids[rows]))
+        count, least = np.count_nonzero(found.located), self._context.config.dynamics.min_points
         if count < least:
             return Refusal(
                 "tracks",
                 f"{least} features with a depth that last from one frame to the next; there "
                 f"are {count} of {len(seen)} (a second camera or a depth image gives the depth)",
             )
-        order = np.argsort(ids)
-        known = points[order][np.searchsorted(ids[order], seen.ids[rows])]
-        solved = rig.cameras[0].body_pose(known, seen.normalized[rows], ERROR_PX)
-        if solved is None or 2 * np.count_nonzero(solved[1]) < count:
+        # the body before is the world here
+        solved = pose_of_most(rig.cameras[0], found.points, seen.normalized[rows])
+        if solved is None:
             return Refusal("fit", "features that fit one motion from one frame to the next")
-        before_T_now, fits = solved
-        self.outliers = np.sort(seen.ids[rows][~fits])
-        return before_T_now
+        self.outliers = np.sort(seen.ids[rows][~solved.fits])
+        return solved.world_T_body
