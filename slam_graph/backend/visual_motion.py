@@ -90,6 +90,7 @@ class VisualMotion:
         self._rig = rig
         self._min_points = min_points
         self._last: FeatureFrame | None = None
+        self._limit_px = 0.0
 
     def note(self, frame: FeatureFrame) -> FeatureFrame | None:
         """Note the next frame, and return the one before it."""
@@ -117,12 +118,14 @@ class VisualMotion:
         if last is not None and abs(frame.stamp_ns - last.stamp_ns - since_ns) > _SAME_NS:
             last = None  # it is not that of the state before
         points = self._known(before, last, known)
-        found, limit_px = predicted, 0.0
+        # one smaller than in the last frame is tried, not all of them
+        limit_px = max((px for px in _ERRORS_PX if px < self._limit_px), default=0.0)
+        found = predicted
         for _ in range(_ROUNDS if self._rig.rolling else 1):
             solved = self._pose(frame, points, self._rate(found, before), limit_px)
             if solved is None:
                 return predicted
-            limit_px = solved.limit_px
+            limit_px = self._limit_px = solved.limit_px
             found = moved_to(before, predicted, solved.world_T_body, self._rig.has_imu)
         return found
 
