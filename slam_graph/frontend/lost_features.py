@@ -6,7 +6,8 @@ A fast turn blurs a few images, and corners are lost in them that are in view ag
 Lucas-Kanade compares two images and does not mind how many were taken in between, so some past
 images are remembered with their corners. Those that are missing are tracked from there to the new
 image, from where the rotation between the two puts them. One that is not found again in a few
-images that can be tracked well is hidden, and is left alone until it has been out of view.
+images that can be tracked well is hidden, and is left alone until it has been out of view. While
+nothing is found, fewer and fewer images are searched, until many corners are lost at once again.
 """
 
 from __future__ import annotations
@@ -35,6 +36,8 @@ _TRIES = 3
 """A corner is looked for in so many good images."""
 _GOOD = 0.75
 """An image is good if this part of the corners is left that there were after the one before."""
+_LONGEST_PAUSE = 16
+"""As many images are left out at most between two that are searched."""
 _FITTING = 0.7
 """Part of the corners that must fit the motion. A wrong one is on its epipolar line by chance once
 in some twenty times; where few fit, those that do are such."""
@@ -91,6 +94,7 @@ class LostFeatures:
         self._levels, self._largest_px = levels, largest_px
         self._past: list[_Remembered] = []
         self._count = 0  # of the corners in the last image
+        self._pause = self._left_out = 0  # images to leave out after a search in vain, and so far
 
     def turn(self, end_R_start: FloatArray) -> None:
         """Take the rotation (3, 3) of the camera since the image before."""
@@ -122,13 +126,29 @@ class LostFeatures:
             inliers: the test that they have in common with those that were followed.
         """
         nothing = np.zeros(0, np.int64), np.zeros((0, 2), np.float32)
+        good = len(after) >= _GOOD * self._count
+        if not good:
+            self._pause = 0
+        if self._left_out < self._pause:
+            self._left_out += 1
+            return nothing
         sought = self._sought(after)
         if not sought or max(map(len, sought)) < _LEAST:
             return nothing
         best = max(range(len(sought)), key=lambda k: (len(sought[k]), k))
         past, rows = self._past[best], sought[best]
-        if len(after) >= _GOOD * self._count:
+        if good:
             self._count_tries(past.tracks.ids[rows])
+        again = self._tracked(past, rows, after, inliers)
+        self._left_out, found = 0, again is not None
+        if good:
+            self._pause = 0 if found else min(2 * self._pause + 1, _LONGEST_PAUSE)
+        return nothing if again is None else again
+
+    def _tracked(
+        self, past: _Remembered, rows: IntArray, after: Tracks, inliers: Inliers
+    ) -> tuple[IntArray, Pixels] | None:
+        """Corners of a past image (rows of it) that are found in the new one; None without any."""
         assert past.tracks.image is not None
         assert after.image is not None
         past.turn = self._rotation.aligned(past.small, after.image, past.turn)
@@ -146,10 +166,10 @@ class LostFeatures:
         ends = self._camera.undistort(flow.points[good].astype(np.float64))
         end = np.concatenate([ends, after.normalized[here]])
         if len(good) < MIN_POINTS or len(start) < 2 * MIN_POINTS:
-            return nothing
+            return None
         fits = inliers(start, end)[: len(good)]
         if np.count_nonzero(fits) < max(MIN_POINTS, _FITTING * len(good)):
-            return nothing
+            return None
         return missing.ids[good[fits]], flow.points[good[fits]]
 
     def _sought(self, after: Tracks) -> list[IntArray]:
