@@ -55,17 +55,16 @@ def camera_pose(
     if not found or rows is None or len(rows) < least:
         return None
     chosen = rows[:, 0]
-    rotation, translation = cv2.solvePnPRefineLM(
-        points[chosen], rays[chosen], np.eye(3), None, rotation, translation
-    )
-    for _ in range(_TIGHTENED if tightened else 0):
-        errors = _errors(points, rays, rotation, translation)
-        if not np.any(errors < error):
-            break
-        median = float(np.median(errors[errors < error]))
-        chosen = np.flatnonzero(errors < min(error, _MAX_MEDIANS * median))
-        if len(chosen) < max(least, _FEWEST):
-            break
+    for refined in range(_TIGHTENED if tightened else 1):
+        if tightened:
+            errors = _errors(points, rays, rotation, translation)
+            near = errors[errors < error]
+            limit = min(error, _MAX_MEDIANS * float(np.median(near))) if len(near) else 0.0
+            tighter = np.flatnonzero(errors < limit)
+            if len(tighter) >= max(least, _FEWEST):
+                chosen = tighter
+            elif refined:
+                break
         rotation, translation = cv2.solvePnPRefineLM(
             points[chosen], rays[chosen], np.eye(3), None, rotation, translation
         )

@@ -7,6 +7,9 @@ of a moving object pass, which then pull the pose. So the features that fit the 
 step is linearised, which is that of PnP, update the prediction first. The others have to pass the
 gate against what is known then (as in 1-point RANSAC for filters: Civera, Grasa, Davison & Montiel
 2010).
+
+The nearest third of the features are always among the others. They tell most of the translation, so
+that a pose which follows them fits nearly all of the farther ones too, if these may turn a little.
 """
 
 from __future__ import annotations
@@ -25,13 +28,15 @@ from slam_graph.backend.solve.square_root import SquareRootInformation
 
 _FEWEST, _LEAST_SHARE = 10, 0.5
 """Fewer features, or a smaller part of them, are no consensus."""
+_NEAREST = 1.0 / 3.0
+"""Part of the features that fit which is near, and no part of the consensus."""
 _CONFIDENCE = 0.99
-"""Share of features at rest that pass the second test, of those that did not fit before."""
+"""Share of features at rest that pass the second test, of those that are not of the consensus."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Fitting:
-    """Which features fit the linearisation point: of the state (N,), and new ones (J,)."""
+class _Consensus:
+    """Observations of features of the state (N,), and new features (J,), that the pose is by."""
 
     landmarks: BoolArray
     tracks: BoolArray
@@ -51,15 +56,15 @@ def gate_by_consensus(
         predicted: what is known of the variables before these measurements.
         tested: (J,) which of the new features are tested; all of them if it is not given.
     """
-    fitting = _fitting(cost, linear)
-    if fitting is None:
+    consensus = _consensus(cost, linear)
+    if consensus is None:
         return cost.gate(linear, predicted, tested)
     try:
-        second = _second_gate(cost, linear, predicted, fitting, tested)
-    except np.linalg.LinAlgError:  # the features that fit do not determine the step
+        second = _second_gate(cost, linear, predicted, consensus, tested)
+    except np.linalg.LinAlgError:  # they do not determine the step
         return cost.gate(linear, predicted, tested)
-    tracks = fitting.tracks | second.tracks
-    admitted = fitting.landmarks | second.landmarks, tracks if tested is None else tracks[tested]
+    tracks = consensus.tracks | second.tracks
+    admitted = consensus.landmarks | second.landmarks, tracks if tested is None else tracks[tested]
     return cost.gate(linear, predicted, tested, admitted=admitted)
 
 
@@ -67,57 +72,68 @@ def _second_gate(
     cost: Cost,
     linear: Linearization,
     predicted: SquareRootInformation,
-    fitting: _Fitting,
+    consensus: _Consensus,
     tested: BoolArray | None,
 ) -> Gate:
-    """The gate against what is known once the features that fit have updated the prediction."""
+    """The gate against what is known once the consensus has updated the prediction."""
     posterior = predicted
-    for rows in _rows(cost, linear, predicted, fitting):
+    for rows in _rows(cost, linear, predicted, consensus):
         posterior = posterior.updated(rows)
     moved = posterior.solution()
     after = _after(cost, linear, moved, predicted)
     return cost.gate(after, posterior, tested, _CONFIDENCE)
 
 
-def _fitting(cost: Cost, linear: Linearization) -> _Fitting | None:
-    """The features without outliers at the linearisation point, None if these are too few.
+def _consensus(cost: Cost, linear: Linearization) -> _Consensus | None:
+    """The features without outliers at the linearisation point, but for the nearest of them.
 
     The limit follows the errors themselves, most of which are of features at rest.
+
+    Returns:
+        None if too few fit.
     """
     errors = linear.errors[np.isfinite(linear.errors)]
     if not len(errors):
         return None
     limit = WIDTH_2D / MEDIAN_2D * float(np.median(errors))
-    landmarks, tracks = np.zeros(0, np.bool_), np.zeros(0, np.bool_)
+    worst, depths = _of_features(cost, linear)
+    # nearer or behind, the slope of the projection tells nothing
+    fits = (worst < limit) & (depths >= cost.config.triangulation.min_depth_m)
+    if np.sum(fits) < max(_FEWEST, _LEAST_SHARE * len(fits)):
+        return None
+    fits &= depths >= np.quantile(depths[fits], _NEAREST)
+    count = 0 if linear.landmarks is None else len(linear.landmarks.errors)
+    return _Consensus(fits[:count], fits[count:])
+
+
+def _of_features(cost: Cost, linear: Linearization) -> tuple[FloatArray, FloatArray]:
+    """Largest errors and smallest depths, of observations of the state and then of new features."""
+    worst, depths = [np.zeros(0)], [np.zeros(0)]
     if linear.landmarks is not None:
-        landmarks = linear.landmarks.errors < limit
-        # nearer or behind, the slope of the projection tells nothing
-        landmarks &= linear.landmarks.depths >= cost.config.triangulation.min_depth_m
+        worst.append(linear.landmarks.errors)
+        depths.append(linear.landmarks.depths)
     if linear.tracks is not None and cost.tracks is not None:
         assert isinstance(linear.tracks, WhitenedObservations)
-        worst = np.zeros(len(cost.tracks.points))
-        np.maximum.at(worst, cost.tracks.obs.feature, linear.tracks.errors)
-        tracks = worst < limit
-    together = np.concatenate([landmarks, tracks])
-    if np.sum(together) < max(_FEWEST, _LEAST_SHARE * len(together)):
-        return None
-    return _Fitting(landmarks, tracks)
+        starts = cost.tracks.obs.starts[:-1]
+        worst.append(np.maximum.reduceat(linear.tracks.errors, starts))
+        depths.append(np.minimum.reduceat(linear.tracks.depths, starts))
+    return np.concatenate(worst), np.concatenate(depths)
 
 
 def _rows(
-    cost: Cost, linear: Linearization, predicted: SquareRootInformation, fitting: _Fitting
+    cost: Cost, linear: Linearization, predicted: SquareRootInformation, consensus: _Consensus
 ) -> list[FloatArray]:
-    """Rows [A b] (m, n + 1) of the features that fit; new ones say what they say of poses."""
+    """Rows [A b] (m, n + 1) of the consensus; new features say what they say of poses."""
     part = replace(cost, landmarks=None, tracks=None)
     landmarks = summed = None
     if linear.landmarks is not None and cost.landmarks is not None:
-        part.landmarks = cost.landmarks.rows(fitting.landmarks)
-        landmarks = linear.landmarks.subset(fitting.landmarks)
-    if linear.tracks is not None and cost.tracks is not None and fitting.tracks.any():
+        part.landmarks = cost.landmarks.rows(consensus.landmarks)
+        landmarks = linear.landmarks.subset(consensus.landmarks)
+    if linear.tracks is not None and cost.tracks is not None and consensus.tracks.any():
         assert isinstance(linear.tracks, WhitenedObservations)
-        chosen = cost.tracks.subset(fitting.tracks)
+        chosen = cost.tracks.subset(consensus.tracks)
         part.tracks = replace(chosen, in_state=np.zeros(len(chosen.points), np.bool_))
-        observed = linear.tracks.subset(fitting.tracks[cost.tracks.obs.feature])
+        observed = linear.tracks.subset(consensus.tracks[cost.tracks.obs.feature])
         summed = sum_features(part.tracks.obs, observed)
     return part.rows(Linearization(landmarks, summed, linear.errors), predicted.layout)
 
