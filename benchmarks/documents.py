@@ -253,6 +253,29 @@ def mono_real_imu(figures: Figures) -> Iterator[str]:
         yield line(f"{label}{held}", *cells, figures(f"{best}.smoothed", 4), scale)
 
 
+def consistency_real(figures: Figures) -> Iterator[str]:
+    """NEES of the first 30 s of flights with their real IMU, one camera and two."""
+    labels = ["_".join(path.split("/")[-1].split("_")[:2]) for path in FLIGHTS]
+    held = [", held out" if flight_is_held_out(Path(path)) else "" for path in FLIGHTS]
+    yield line("", *(f"{label}{part}" for label, part in zip(labels, held, strict=True)))
+    yield f"|---|{'---|' * len(FLIGHTS)}"
+    for name in (*RECURSIVE, *PEERS, "smoothed_msckf"):
+        cells = []
+        for path in FLIGHTS:
+            runs = [
+                f"consistency_real.{path.split('/')[-1]}.{n}.{name}" for n in ("mono", "stereo")
+            ]
+            cells.append(
+                " / ".join(
+                    figures.all(
+                        [f"{run}.nees_{part}" for part in ("position", "orientation")], 1, ", "
+                    )
+                    for run in runs
+                )
+            )
+        yield line(f"`{name}`" if name in (*RECURSIVE, *PEERS) else "`msckf`, smoothed", *cells)
+
+
 def held_out(figures: Figures) -> Iterator[str]:
     """What no parameter was chosen on."""
     yield "| | V2_02, 30 s | MH_04, 30 s | ten simulated flights of 15 s |"
@@ -363,6 +386,7 @@ TABLES: dict[str, Callable[[Figures], Iterator[str]]] = {
     "monte_carlo": monte_carlo,
     "real_imu": real_imu,
     "mono_real_imu": mono_real_imu,
+    "consistency_real": consistency_real,
     "held_out": held_out,
     "performance": performance,
     "performance_parts": performance_parts,

@@ -297,7 +297,7 @@ def test_the_motion_is_that_of_most_points_also_where_others_are_near() -> None:
     rng, mounted = np.random.default_rng(2), RigCamera(CAMERA, gtsam.Pose3())
     far = rng.uniform([-3, -2, 2], [3, 2, 16], (90, 3))
     near = rng.uniform([-0.4, -0.4, 2.5], [0.4, 0.4, 3.2], (40, 3))
-    seen = np.vstack([far, near + [0.06, 0.0, 0.0]])
+    seen = np.vstack([far, near + np.array([0.06, 0.0, 0.0])])
     rays = seen[:, :2] / seen[:, 2:] + rng.normal(0.0, 0.3 / CAMERA.fx, (130, 2))
     solved = pose_of_most(mounted, np.vstack([far, near]), rays)
     assert solved is not None
