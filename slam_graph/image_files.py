@@ -17,6 +17,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+__all__ = ["ImageFile"]
+
 _PNG_BEGIN, _JPEG_BEGIN, _JPEG_END = b"\x89PNG\r\n\x1a\n", b"\xff\xd8", b"\xff\xd9"
 
 _FORMATS = "PNG, JPEG, BMP, TIFF, PGM, PPM, WebP"
@@ -39,21 +41,32 @@ _MOST_TAGS = 1000
 Size = tuple[int, int]
 
 
-def decode_image(data: bytes, flags: int) -> NDArray[Any] | str:
-    """The image in the bytes of a file, or what is wrong with them.
+class ImageFile:
+    """The bytes of an image file."""
 
-    Args:
-        data: bytes of the file.
-        flags: OpenCV's, of `cv2.imdecode`.
-    """
-    fault = find_damage(data) or _fault_of_size(data)
-    if fault is not None:
-        return fault
-    try:
-        image: NDArray[Any] | None = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
-    except cv2.error as error:
-        return str(error.err)
-    return "not an image that OpenCV can read" if image is None else image
+    @staticmethod
+    def decode(data: bytes, flags: int) -> NDArray[Any] | str:
+        """The image in the bytes of a file, or what is wrong with them.
+
+        Args:
+            data: bytes of the file.
+            flags: OpenCV's, of `cv2.imdecode`.
+        """
+        fault = find_damage(data) or _fault_of_size(data)
+        if fault is not None:
+            return fault
+        try:
+            image: NDArray[Any] | None = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+        except cv2.error as error:
+            return str(error.err)
+        return "not an image that OpenCV can read" if image is None else image
+
+    @staticmethod
+    def fault_of_claim(size: Size, length: int) -> str | None:
+        """What is wrong with a file that claims images of so many pixels for its bytes."""
+        if size[0] * size[1] > max(_MOST_PIXELS, _MOST_PER_BYTE * length):
+            return f"claims {size[0]}x{size[1]} pixels in {length} bytes"
+        return None
 
 
 def find_damage(data: bytes) -> str | None:
@@ -91,14 +104,7 @@ def _fault_of_size(data: bytes) -> str | None:
         size = None
     if size is None:
         return f"not an image ({_FORMATS}), or damaged"
-    return fault_of_claim(size, len(data))
-
-
-def fault_of_claim(size: Size, length: int) -> str | None:
-    """What is wrong with a file that claims images of so many pixels for its length in bytes."""
-    if size[0] * size[1] > max(_MOST_PIXELS, _MOST_PER_BYTE * length):
-        return f"claims {size[0]}x{size[1]} pixels in {length} bytes"
-    return None
+    return ImageFile.fault_of_claim(size, len(data))
 
 
 def _claimed_size(data: bytes) -> Size | None:

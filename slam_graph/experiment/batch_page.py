@@ -19,7 +19,7 @@ import cv2
 from slam_graph.errors import DataError
 from slam_graph.experiment.batch_summary import NOT_DONE, Row
 from slam_graph.experiment.path_thumbnail import CAUSAL, SMOOTHED, TRUE, thumbnail
-from slam_graph.image_files import decode_image
+from slam_graph.image_files import ImageFile
 from slam_graph.results import ResultFolder, load_result
 
 _PICTURE = "trajectory.png"
@@ -188,7 +188,7 @@ def _path(folder: Path) -> str:
 
 def _embedded(path: Path) -> str | None:
     """A picture as an address that holds it, smaller than it was."""
-    image = decode_image(path.read_bytes(), cv2.IMREAD_COLOR) if path.is_file() else ""
+    image = ImageFile.decode(path.read_bytes(), cv2.IMREAD_COLOR) if path.is_file() else ""
     if isinstance(image, str):
         return None
     height, width = image.shape[:2]

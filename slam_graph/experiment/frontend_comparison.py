@@ -5,11 +5,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
-
-import numpy as np
 
 from slam_graph.config import RunConfig
 from slam_graph.datasets import Sequence
@@ -17,7 +15,7 @@ from slam_graph.errors import DataError
 from slam_graph.experiment.track_quality import TrackQuality, TrackSummary
 from slam_graph.frontend import build_frontend
 from slam_graph.pipeline import Tracking, run
-from slam_graph.results import RunLogs
+from slam_graph.results import RunResult
 from slam_graph.sensors import FeatureFrame, Packet
 
 
@@ -80,14 +78,14 @@ class FrontendReport:
         start_ns = info.start_ns + round(config.start_s * 1e9)
         end_ns = None if config.duration_s is None else start_ns + round(config.duration_s * 1e9)
         packets = sequence.packets(start_ns if config.start_s > 0 else None, end_ns)
-        logs = RunLogs()
+        logs = RunResult.Logs()
         with Tracking(packets, frontend).in_turn() as tracking:
             for tracked in tracking:
                 packet, features = tracked.packet, tracked.features
                 quality.write(packet.imu, features)
                 logs.count_frame(features.stamp_ns, tracked.clock.milliseconds, tracked.frame_stats)
                 watch(packet, features)
-        return _report(name, quality, logs)
+        return _report(name, quality, logs.features, logs.frontend_milliseconds(), logs.frames)
 
     @staticmethod
     def of_run(sequence: Sequence, config: RunConfig, name: str) -> FrontendReport:
@@ -102,31 +100,28 @@ class FrontendReport:
         result = run(sequence, config, recorder=quality)
         accuracy = result.metrics.get("accuracy") or {}
         ate_m = accuracy.get("se3", {}).get("ate", {}).get("translation_m", {}).get("rmse")
-        return _report(name, quality, result.logs, ate_m, result.status)
+        logs = result.logs
+        took_ms = logs.frontend_milliseconds()
+        return _report(name, quality, logs.features, took_ms, logs.frames, ate_m, result.status)
 
 
 def _report(
     name: str,
     quality: TrackQuality,
-    logs: RunLogs,
+    counts: Mapping[str, int],
+    milliseconds: dict[str, float],
+    frames: int,
     ate_m: float | None = None,
     status: str = "",
 ) -> FrontendReport:
-    counts, timing = logs.features, logs.timing
-    frames = max(len(timing), 1)
     good = counts["tracked"] - counts["recovered"]
     bad = counts["rejected_ransac"] + counts["rejected_map"]
-    ms = {"total": float(np.mean(timing.column("frontend")))} if len(timing) else {}
-    for stage in timing.stages():
-        if stage.startswith("frontend."):
-            values = timing.column(stage)
-            ms[stage.removeprefix("frontend.")] = float(np.nansum(values)) / frames
     return FrontendReport(
         name,
         quality.summary(),
         good / (good + bad) if good + bad else math.nan,
-        {key: value / frames for key, value in sorted(counts.items()) if value},
-        ms,
+        {key: value / max(frames, 1) for key, value in sorted(counts.items()) if value},
+        milliseconds,
         ate_m,
         status,
     )

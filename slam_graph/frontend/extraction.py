@@ -15,7 +15,7 @@ from slam_graph.errors import ConfigError
 from slam_graph.frontend.detectors import refine
 from slam_graph.frontend.frontend_config import DETECTORS, FrontendConfig
 from slam_graph.frontend.keypoints import Image, Keypoints, Pixels, spread
-from slam_graph.image_files import decode_image
+from slam_graph.image_files import ImageFile
 from slam_graph.kernels.spacing import claim, clear_disks
 from slam_graph.sensors import Camera
 
@@ -294,7 +294,7 @@ def _read_mask(path: Path, width: int, height: int) -> Image:
     """
     if not path.is_file():
         raise ConfigError(f"{path}: the mask of a camera is missing")
-    image = decode_image(path.read_bytes(), cv2.IMREAD_GRAYSCALE)
+    image = ImageFile.decode(path.read_bytes(), cv2.IMREAD_GRAYSCALE)
     if isinstance(image, str):
         raise ConfigError(
             f"{path}: the mask of a camera cannot be read ({image}); take another copy"

@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import logging
 import math
-from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from typing import TYPE_CHECKING
@@ -23,18 +22,15 @@ import numpy as np
 
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import DataError, EstimationError
-from slam_graph.pipeline.clock_watch import SPACING_NS, ClockWatch
+from slam_graph.pipeline.clock_watch import ClockWatch
+from slam_graph.pipeline.kept_frames import KEPT_NS, KeptFrames
 from slam_graph.pipeline.stage import COMPLETED, EstimatedFrame, NoObjects, Stage, warn_on_failure
 from slam_graph.results import RunResult
-from slam_graph.sensors import CameraFrame, FeatureFrame, ImuData, Rig
+from slam_graph.sensors import ImuData, Rig
 
 if TYPE_CHECKING:
     from slam_graph.diagnosis import Diagnosis
 
-_KEPT_NS = 24_000_000_000
-"""So much of the recording is looked at: what came after the start, as far as it goes."""
-_PAIRS, _PAIRS_APART_NS = 4, 1_500_000_000
-"""Images of two cameras that are kept, and the time between them."""
 _FIRST_LOOK_NS = 5_000_000_000
 """A run that has waited so long for a start is looked at, and again after twice that."""
 _HINDERING = {"gyroscope_scale": 0.1, "baseline": 0.3}
@@ -75,69 +71,6 @@ def _ruins(kind: str, values: Mapping[str, object]) -> bool:
     return kind in _RUINING and _hinders(kind, values, _RUINING)
 
 
-class _Memory:
-    """What is kept of a recording: features, IMU samples and a few pairs of images."""
-
-    def __init__(self, pairs: bool, objects: NoObjects) -> None:
-        """Begin with nothing; `pairs` says whether images of two cameras are of use."""
-        self._objects = objects
-        self._frames: deque[tuple[FeatureFrame, ImuData]] = deque()
-        self._unjudged: set[int] = set()  # stamps of frames in which nothing says what moves
-        self._since: list[ImuData] = []
-        self._pairs: deque[CameraFrame] | None = deque(maxlen=_PAIRS) if pairs else None
-
-    def __len__(self) -> int:
-        return len(self._frames)
-
-    @property
-    def frames(self) -> list[FeatureFrame]:
-        """Features of the frames that are kept, without those that move by themselves.
-
-        Where moving objects are estimated, frames before there is a state would have theirs.
-        """
-        frames = [features for features, _ in self._frames]
-        judged = [frame for frame in frames if frame.stamp_ns not in self._unjudged]
-        return [features.without(self._objects.moved) for features in judged or frames]
-
-    @property
-    def imu(self) -> ImuData:
-        """All samples between them."""
-        return ImuData.concatenate([samples for _, samples in self._frames])
-
-    @property
-    def pairs(self) -> list[CameraFrame]:
-        """Images of the first two cameras."""
-        return list(self._pairs or ())
-
-    @property
-    def shared(self) -> float:
-        """Share of the features of the first camera that the second one sees, the median."""
-        seen = [frame.cameras for frame in self.frames if len(frame.cameras) > 1]
-        shares = [np.isin(c[0].ids, c[1].ids).mean() for c in seen if len(c[0])]
-        return float(np.median(shares)) if shares else 0.0
-
-    def add(self, frame: EstimatedFrame) -> None:
-        """Keep a frame, if the last one was long enough ago, and forget old ones."""
-        stamp_ns, frames = frame.features.stamp_ns, self._frames
-        self._since.append(frame.imu)
-        if frames and stamp_ns - frames[-1][0].stamp_ns < SPACING_NS:
-            return
-        frames.append((frame.features, ImuData.concatenate(self._since)))
-        if frame.objects is not None and frame.state is None:
-            self._unjudged.add(stamp_ns)
-        self._since = []
-        while frames[0][0].stamp_ns < stamp_ns - _KEPT_NS:
-            frames.popleft()
-        images, pairs = frame.packet.frame, self._pairs
-        if pairs is None or not isinstance(images, CameraFrame):
-            return
-        if pairs and stamp_ns - pairs[-1].stamp_ns < _PAIRS_APART_NS:
-            return
-        first, second = images.images[:2]
-        if first is not None and second is not None:
-            pairs.append(images)
-
-
 class Verdict(Stage):
     """Keeps frames around the start of a run, and judges by them whether it can be trusted.
 
@@ -154,7 +87,7 @@ class Verdict(Stage):
         objects = objects or NoObjects()
         self._estimates_objects = type(objects) is not NoObjects
         rig = result.input.rig
-        self._kept = _Memory(len(rig.cameras) > 1, objects)
+        self._kept = KeptFrames(len(rig.cameras) > 1, objects)
         self._clocks = ClockWatch(result, objects, diagnostics) if rig.has_imu else None
         self._estimated = self._at_limit = 0  # frames with a state; noise of the IMU at its limit
         self._looked: Diagnosis | None = None  # a quick look at all that is kept
@@ -185,7 +118,7 @@ class Verdict(Stage):
             self._started_ns = None
         elif self._started_ns is None:
             self._started_ns = stamp_ns
-        elif stamp_ns > self._started_ns + _KEPT_NS:
+        elif stamp_ns > self._started_ns + KEPT_NS:
             self._watch_full()
             return
         self._kept.add(frame)

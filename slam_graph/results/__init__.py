@@ -11,7 +11,6 @@ __all__ = [
     "PoseGraphResult",
     "ResultFolder",
     "RunInput",
-    "RunLogs",
     "RunResult",
     "SavedRun",
     "export_map",
@@ -25,7 +24,6 @@ if TYPE_CHECKING:
     from slam_graph.results.optimization_result import BalResult, PoseGraphResult
     from slam_graph.results.result_files import ResultFolder
     from slam_graph.results.run_input import RunInput
-    from slam_graph.results.run_logs import RunLogs
     from slam_graph.results.run_result import RunResult
     from slam_graph.results.saved_run import SavedRun, load_result
 else:
@@ -42,7 +40,6 @@ else:
                 "PoseGraphResult",
             ),
             "result_files": ("ResultFolder",),
-            "run_logs": ("RunLogs",),
             "run_input": ("RunInput",),
             "run_result": ("RunResult",),
             "saved_run": (

@@ -293,3 +293,14 @@ class RunLogs:
         for name, count in frame_stats.items():
             if not name.endswith("_ms"):
                 self.features[name] += int(count)
+
+    def frontend_milliseconds(self) -> dict[str, float]:
+        """Milliseconds a frame of the front end, in total and of each of its parts."""
+        if not len(self.timing):
+            return {}
+        found = {"total": float(np.mean(self.timing.column("frontend")))}
+        for stage in self.timing.stages():
+            if stage.startswith("frontend."):
+                total = float(np.nansum(self.timing.column(stage)))
+                found[stage.removeprefix("frontend.")] = total / len(self.timing)
+        return found

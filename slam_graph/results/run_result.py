@@ -78,6 +78,8 @@ class RunResult(RunSummary):
         warnings: counted faults and rejections.
     """
 
+    Logs = RunLogs
+
     input: RunInput
     ending: Ending = field(default_factory=Ending)
     history: StateHistory = field(default_factory=StateHistory)

@@ -33,7 +33,7 @@ from slam_graph.datasets.streams.image_sequence import (
 from slam_graph.datasets.streams.images import Fault, Image, prefetch
 from slam_graph.datasets.streams.pairing import Groups, group_by_time, in_order
 from slam_graph.errors import DataError
-from slam_graph.image_files import fault_of_claim
+from slam_graph.image_files import ImageFile
 from slam_graph.sensors import CameraFrame
 
 SUFFIXES = {".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v", ".mpg", ".mpeg", ".mjpeg", ".h264"}
@@ -72,7 +72,7 @@ class _VideoReader:
         self._most = path.stat().st_size
         sides = (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT)
         width, height = (int(self._capture.get(side)) for side in sides)
-        fault = fault_of_claim((width, height), self._most)
+        fault = ImageFile.fault_of_claim((width, height), self._most)
         if fault is not None:
             self.close()
             raise DataError(f"{path}: this video {fault}; it is damaged")

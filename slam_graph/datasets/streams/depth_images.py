@@ -17,7 +17,7 @@ from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.datasets.streams.images import Fault, FileImages
 from slam_graph.datasets.streams.pairing import ABSENT
 from slam_graph.errors import DataError
-from slam_graph.image_files import decode_image
+from slam_graph.image_files import ImageFile
 from slam_graph.sensors import Camera, DepthSensor, Rig
 
 DEPTH_TOLERANCE_S = 0.02
@@ -222,7 +222,7 @@ def decode_depth(data: bytes, where: str) -> NDArray[Any] | Fault:
     Returns:
         (height, width) uint16 or float32, or a fault of kind `depth_unreadable`.
     """
-    image = decode_image(data, cv2.IMREAD_UNCHANGED)
+    image = ImageFile.decode(data, cv2.IMREAD_UNCHANGED)
     if isinstance(image, str):
         return Fault("depth_unreadable", f"{where}: {image}")
     if image.ndim != 2 or image.dtype not in (np.uint16, np.float32):

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from slam_graph.arrays import IntArray
 from slam_graph.errors import DataError
-from slam_graph.image_files import decode_image
+from slam_graph.image_files import ImageFile
 
 T = TypeVar("T")
 
@@ -109,7 +109,7 @@ def decode_grey(data: bytes, where: str) -> Image | Fault:
     Returns:
         (height, width) uint8, or a fault of kind `image_unreadable`.
     """
-    image = decode_image(data, cv2.IMREAD_GRAYSCALE)
+    image = ImageFile.decode(data, cv2.IMREAD_GRAYSCALE)
     if isinstance(image, str):
         return Fault("image_unreadable", f"{where}: {image}")
     return image.astype(np.uint8, copy=False)

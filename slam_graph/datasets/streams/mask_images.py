@@ -24,7 +24,7 @@ from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.datasets.streams.csv_rows import check_times, read_rows
 from slam_graph.errors import DataError
 from slam_graph.files import Files
-from slam_graph.image_files import decode_image
+from slam_graph.image_files import ImageFile
 
 MASKS = "masks"
 """Name of the folder beside a recording."""
@@ -125,7 +125,7 @@ def _drawn(boxes: NDArray[np.void], size: tuple[int, int]) -> LabelImage:
 
 def _read_image(path: Path, size: tuple[int, int]) -> LabelImage:
     try:
-        image = decode_image(path.read_bytes(), cv2.IMREAD_UNCHANGED)
+        image = ImageFile.decode(path.read_bytes(), cv2.IMREAD_UNCHANGED)
     except OSError as error:
         raise DataError(f"{path}: cannot be read ({error.strerror})") from error
     if isinstance(image, str):
