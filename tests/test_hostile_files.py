@@ -4,15 +4,12 @@
 
 import bz2
 import shutil
-import struct
 from collections.abc import Callable
 from pathlib import Path
 from typing import get_args
-from zlib import crc32
 
 import numpy as np
 import pytest
-from damage import MOST_MB, memory_mb
 from hostile import ALIASES, read_all
 from recordings import edit_text, write_euroc, write_openvins
 from recordings_loose import write_times, write_video
@@ -31,7 +28,6 @@ from slam_graph.datasets.groundtruth import read_groundtruth
 from slam_graph.datasets.streams.aiding_files import read_fixes
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import ConfigError, DataError, SlamGraphError
-from slam_graph.frontend.extraction import camera_mask
 from slam_graph.pose_graph.graph import InformationRepair
 from slam_graph.pose_graph.graph_files import read_pose_graph
 from slam_graph.results.result_files import ResultFolder, folder_name
@@ -356,38 +352,6 @@ def test_no_image_of_another_folder_is_read(tmp_path: Path) -> None:
         index.write_text("\n".join(changed) + "\n")
         with pytest.raises(DataError, match=r"rgb\.txt:\d+: .* is not a file in"):
             read_all(folder)
-
-
-def test_masks_that_claim_too_much_are_refused(tmp_path: Path) -> None:
-    mask = tmp_path / "mask.png"
-    side = 30_000
-    bitmap = b"BM" + bytes(12) + struct.pack("<Iiihh", 40, side, side, 1, 8) + bytes(24)
-    for data in (claiming_png(100_000), claiming_png(2**31 - 1), bitmap, b"P5 30000 30000 255 "):
-        mask.write_bytes(data)
-        memory_mb(reset=True)
-        before_mb = memory_mb()
-        with pytest.raises(ConfigError, match=r"mask\.png: the mask of a camera cannot be read"):
-            camera_mask(simulate(duration_s=1.0).rig.cameras[0].camera, mask, 21)
-        assert memory_mb() < before_mb + MOST_MB
-
-
-def claiming_png(side: int) -> bytes:
-    """The begin of a PNG that claims a square of so many pixels a side."""
-    header = b"IHDR" + struct.pack(">IIBBBBB", side, side, 8, 0, 0, 0, 0)
-    chunk = (13).to_bytes(4, "big") + header + crc32(header).to_bytes(4, "big")
-    return b"\x89PNG\r\n\x1a\n" + chunk
-
-
-@pytest.mark.parametrize("chunk", [b"IDAT", b"IHDR"])
-def test_a_mask_that_claims_a_long_part_is_not_decoded(tmp_path: Path, chunk: bytes) -> None:
-    """OpenCV takes memory for it before it reads it: 700 MB for 16 bytes."""
-    mask = tmp_path / "mask.png"
-    mask.write_bytes(b"\x89PNG\r\n\x1a\n" + (757_000_000).to_bytes(4, "big") + chunk)
-    memory_mb(reset=True)
-    before_mb = memory_mb()
-    with pytest.raises(ConfigError, match=r"mask\.png: .* cannot be read \(truncated PNG"):
-        camera_mask(simulate(duration_s=1.0).rig.cameras[0].camera, mask, 21)
-    assert memory_mb() < before_mb + MOST_MB
 
 
 def test_bytes_that_are_no_text_are_refused(tmp_path: Path) -> None:

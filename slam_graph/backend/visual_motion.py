@@ -10,9 +10,9 @@ PnP from points that are known already: features of the estimator, and those who
 frame has by a second camera or a depth sensor. It is the point at which the new state is
 linearised, not a measurement: its images still come, and count once.
 
-The motion that is found is that of most features. So far features count as well, although two
-cameras hardly tell their depth: the motion between two frames moves them by no more than the error
-of their disparity in the image, where it is shorter than the baseline. Without them a moving object
+The motion that is found is that of most features. Features that are far away count as well,
+although two cameras hardly tell their depth: while the motion is shorter than the baseline, it
+moves them in the image by no more than the error of their disparity. Without them a moving object
 that is near has half of the points.
 """
 
@@ -50,8 +50,8 @@ class KnownPoints:
     Attributes:
         ids: (N,).
         points: (N, 3) m, in the frame that is said where it is made.
-        located: (N,) whether the depth is known; the others are so far away that only their
-            direction is.
+        located: (N,) whether the depth is known well. Else it is that of too little parallax, or
+            75 m where the parallax is not positive.
     """
 
     ids: IntArray
@@ -70,7 +70,7 @@ class PoseOfMost:
     Attributes:
         world_T_body: the pose.
         fits: (N,) which points fit it.
-        limit_px: the largest error of these.
+        limit_px: the limit of the errors, in pixels, under which they fit.
     """
 
     world_T_body: gtsam.Pose3
@@ -118,14 +118,14 @@ class VisualMotion:
         if last is not None and abs(frame.stamp_ns - last.stamp_ns - since_ns) > _SAME_NS:
             last = None  # it is not that of the state before
         points = self._known(before, last, known)
-        # one smaller than in the last frame is tried, not all of them
-        limit_px = max((px for px in _ERRORS_PX if px < self._limit_px), default=0.0)
+        # begin one limit below that of the last frame: each one that is tried costs a RANSAC
+        least_px = max((px for px in _ERRORS_PX if px < self._limit_px), default=0.0)
         found = predicted
         for _ in range(_ROUNDS if self._rig.rolling else 1):
-            solved = self._pose(frame, points, self._rate(found, before), limit_px)
+            solved = self._pose(frame, points, self._rate(found, before), least_px)
             if solved is None:
                 return predicted
-            limit_px = self._limit_px = solved.limit_px
+            self._limit_px = solved.limit_px
             found = moved_to(before, predicted, solved.world_T_body, self._rig.has_imu)
         return found
 
@@ -216,6 +216,9 @@ def depths_within(frame: FeatureFrame, rig: Rig, rate: FloatArray | None = None)
         rig: its cameras.
         rate: (3,) angular rate of the body, rad/s, by which rows of a rolling shutter differ; None
             for none.
+
+    Returns:
+        All of them, located or not.
     """
     seen, mounted = frame.cameras[0], rig.cameras[0]
     if len(rig.cameras) < 2 or len(seen.ids) == 0:

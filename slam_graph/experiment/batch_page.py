@@ -188,7 +188,10 @@ def _path(folder: Path) -> str:
 
 def _embedded(path: Path) -> str | None:
     """A picture as an address that holds it, smaller than it was."""
-    image = ImageFile.decode(path.read_bytes(), cv2.IMREAD_COLOR) if path.is_file() else ""
+    try:
+        image = ImageFile.decode(path.read_bytes(), cv2.IMREAD_COLOR)
+    except OSError:
+        return None
     if isinstance(image, str):
         return None
     height, width = image.shape[:2]

@@ -292,9 +292,12 @@ def _read_mask(path: Path, width: int, height: int) -> Image:
     Raises:
         ConfigError: if it is missing, unreadable, or not of the size of the camera's images.
     """
-    if not path.is_file():
-        raise ConfigError(f"{path}: the mask of a camera is missing")
-    image = ImageFile.decode(path.read_bytes(), cv2.IMREAD_GRAYSCALE)
+    try:
+        image = ImageFile.decode(path.read_bytes(), cv2.IMREAD_GRAYSCALE)
+    except OSError as error:
+        raise ConfigError(
+            f"{path}: the mask of a camera cannot be read: {error.strerror}"
+        ) from error
     if isinstance(image, str):
         raise ConfigError(
             f"{path}: the mask of a camera cannot be read ({image}); take another copy"

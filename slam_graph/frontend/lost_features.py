@@ -7,7 +7,8 @@ Lucas-Kanade compares two images and does not mind how many were taken in betwee
 images are remembered with their corners. Those that are missing are tracked from there to the new
 image, from where the rotation between the two puts them. One that is not found again in a few
 images that can be tracked well is hidden, and is left alone until it has been out of view. While
-nothing is found, fewer and fewer images are searched, until many corners are lost at once again.
+nothing is found, fewer and fewer images are searched, unless many corners are lost at once, or more
+are missing than are followed.
 """
 
 from __future__ import annotations
@@ -129,11 +130,12 @@ class LostFeatures:
         good = len(after) >= _GOOD * self._count
         if not good:
             self._pause = 0
-        if self._left_out < self._pause:
+        sought = self._sought(after)
+        most = max(map(len, sought), default=0)
+        if self._left_out < self._pause and most <= len(after):
             self._left_out += 1
             return nothing
-        sought = self._sought(after)
-        if not sought or max(map(len, sought)) < _LEAST:
+        if most < _LEAST:
             return nothing
         best = max(range(len(sought)), key=lambda k: (len(sought[k]), k))
         past, rows = self._past[best], sought[best]

@@ -19,7 +19,7 @@ KEPT_NS = 24_000_000_000
 _PAIRS, _PAIRS_APART_NS = 4, 1_500_000_000
 """Images of two cameras that are kept, and the time between them."""
 _LEAST_LEFT = 0.6
-"""Features that the gate rejects are left out where this part of all is left."""
+"""Features that the gate rejects are left out where this part of the observations is left."""
 
 
 def _count(frames: list[FeatureFrame]) -> int:
@@ -66,16 +66,17 @@ class KeptFrames:
         """Features of the frames that are kept, without those that move by themselves.
 
         Such are those of moving objects, and what the gate has rejected: a board before the camera
-        would look like another mounting or focal length. Where most are rejected, the estimate is
-        wrong and not they. Where moving objects are estimated, frames before there is a state would
-        have theirs.
+        would look like another mounting or focal length. Where more than 40 % of the observations
+        are theirs, the estimate is wrong and not they. Where moving objects are estimated, frames
+        before there is a state would have theirs.
         """
         if not self._frames:
             return []
         frames = [kept.features for kept in self._frames]
         judged = [frame for frame in frames if frame.stamp_ns not in self._unjudged] or frames
         still = [frame.without(self._objects.moved) for frame in judged]
-        rejected = np.unique(np.concatenate([kept.rejected for kept in self._frames]))
+        since = [ids for _, ids in self._since]
+        rejected = np.unique(np.concatenate([*(kept.rejected for kept in self._frames), *since]))
         left = [frame.without(rejected) for frame in still]
         return left if _count(left) >= _LEAST_LEFT * _count(still) else still
 

@@ -67,7 +67,7 @@ class RunResult(RunSummary):
             the states.
         corrected_rig: the calibration with which the run began anew; None if it did not.
         point_map: last estimates of the features that were in the state.
-        logs: what was noted at every frame.
+        logs: what was noted at every frame. `Logs` is their class, for a front end alone.
         final_ba: the smoothed trajectory and its summary, if there is one.
         loops: loop closures, if loops were to be closed.
         slam_map: the map, if one was to be built.

@@ -27,7 +27,8 @@ from slam_graph.backend.cost.robust_loss import MEDIAN_2D, WIDTH_2D
 from slam_graph.backend.solve.square_root import SquareRootInformation
 
 _FEWEST, _LEAST_SHARE = 10, 0.5
-"""Fewer features, or a smaller part of them, are no consensus."""
+"""Where fewer features fit, or a smaller part of them, there is no consensus. The nearest third of
+them is taken away after that."""
 _NEAREST = 1.0 / 3.0
 """Part of the features that fit which is near, and no part of the consensus."""
 _CONFIDENCE = 0.99
