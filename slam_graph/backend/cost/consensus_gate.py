@@ -31,7 +31,7 @@ _FEWEST, _LEAST_SHARE = 10, 0.5
 them is taken away after that."""
 _NEAREST = 1.0 / 3.0
 """Part of the features that fit which is near, and no part of the consensus."""
-_CONFIDENCE = 0.99
+_CONFIDENCE = 0.999
 """Share of features at rest that pass the second test, of those that are not of the consensus."""
 
 
