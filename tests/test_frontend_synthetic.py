@@ -314,7 +314,7 @@ def test_bad_options_are_refused(tmp_path: Path) -> None:
         FrontendConfig(method="magic")
     with pytest.raises(ValidationError, match="unknown detector 'harriss'; did you mean 'harris'"):
         FrontendConfig(detector="harriss")
-    with pytest.raises(ConfigError, match="missing or not a readable image"):
+    with pytest.raises(ConfigError, match="cannot be read: No such file"):
         build_frontend(MONO, FrontendConfig(masks=(tmp_path / "nowhere.png",)))
     cv2.imwrite(str(tmp_path / "small.png"), np.zeros((10, 10), np.uint8))
     with pytest.raises(ConfigError, match="mask is 10x10"):
