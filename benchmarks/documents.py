@@ -234,6 +234,12 @@ def real_imu(figures: Figures) -> Iterator[str]:
         yield line(f"`{name}`", *cells)
 
 
+def _label(path: str) -> str:
+    """The name of a flight, without how difficult it is."""
+    name = "_".join(path.split("/")[-1].split("_")[:2])
+    return f"{name}, held out" if flight_is_held_out(Path(path)) else name
+
+
 def mono_real_imu(figures: Figures) -> Iterator[str]:
     """Errors, NEES and scale with one camera on flights with their real IMU, over seeds."""
     yield "| | `msckf` | `swf` | `okvis` | smoothed | scale |"
@@ -248,32 +254,23 @@ def mono_real_imu(figures: Figures) -> Iterator[str]:
             cells.append(f"{errors} / {figures.all(nees, 1, ', ')}")
         best = f"mono_real_imu.{flight}.{CORE[0]}"
         scale = f"{100 * float(figures(f'{best}.scale_error', 5)):.2f} %"
-        label = "_".join(flight.split("_")[:2])  # without how difficult it is
-        held = ", held out" if flight_is_held_out(Path(path)) else ""
-        yield line(f"{label}{held}", *cells, figures(f"{best}.smoothed", 4), scale)
+        yield line(_label(path), *cells, figures(f"{best}.smoothed", 4), scale)
 
 
 def consistency_real(figures: Figures) -> Iterator[str]:
     """NEES of the first 30 s of flights with their real IMU, one camera and two."""
-    labels = ["_".join(path.split("/")[-1].split("_")[:2]) for path in FLIGHTS]
-    held = [", held out" if flight_is_held_out(Path(path)) else "" for path in FLIGHTS]
-    yield line("", *(f"{label}{part}" for label, part in zip(labels, held, strict=True)))
+    yield line("", *map(_label, FLIGHTS))
     yield f"|---|{'---|' * len(FLIGHTS)}"
-    for name in (*RECURSIVE, *PEERS, "smoothed_msckf"):
+    parts = ("position", "orientation")
+    for name in (*RECURSIVE, *PEERS, f"smoothed_{CORE[0]}"):
         cells = []
         for path in FLIGHTS:
-            runs = [
-                f"consistency_real.{path.split('/')[-1]}.{n}.{name}" for n in ("mono", "stereo")
-            ]
-            cells.append(
-                " / ".join(
-                    figures.all(
-                        [f"{run}.nees_{part}" for part in ("position", "orientation")], 1, ", "
-                    )
-                    for run in runs
-                )
-            )
-        yield line(f"`{name}`" if name in (*RECURSIVE, *PEERS) else "`msckf`, smoothed", *cells)
+            flight = f"consistency_real.{path.split('/')[-1]}"
+            runs = [f"{flight}.{cameras}.{name}.nees_" for cameras in ("mono", "stereo")]
+            both = [figures.all([run + part for part in parts], 1, ", ") for run in runs]
+            cells.append(" / ".join(both))
+        algorithm = name.removeprefix("smoothed_")
+        yield line(f"`{algorithm}`" if algorithm == name else f"`{algorithm}`, smoothed", *cells)
 
 
 def held_out(figures: Figures) -> Iterator[str]:

@@ -62,6 +62,12 @@ class KnownPoints:
         """Some of them, by a mask or by indices."""
         return KnownPoints(self.ids[rows], self.points[rows], self.located[rows])
 
+    def seen(self, ids: IntArray) -> tuple[BoolArray, KnownPoints]:
+        """Which of some features (M,) are known, and these, in their order."""
+        known = self.subset(np.argsort(self.ids))
+        rows = is_in(ids, known.ids)
+        return rows, known.subset(np.searchsorted(known.ids, ids[rows]))
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PoseOfMost:
@@ -144,7 +150,7 @@ class VisualMotion:
     def _known(
         self, before: NavState, last: FeatureFrame | None, known: tuple[IntArray, FloatArray]
     ) -> KnownPoints:
-        """Known features in the world, ascending ids, and those of the last frame."""
+        """Known features in the world, and those of the last frame."""
         ids, points = known
         located = np.ones(len(ids), np.bool_)
         if last is not None:
@@ -154,15 +160,14 @@ class VisualMotion:
             ids = np.concatenate([ids, seen.ids])
             points = np.concatenate([points, world.reshape(-1, 3)])
             located = np.concatenate([located, seen.located])
-        return KnownPoints(ids, points, located).subset(np.argsort(ids))
+        return KnownPoints(ids, points, located)
 
     def _pose(
         self, frame: FeatureFrame, known: KnownPoints, rate: FloatArray, least_px: float
     ) -> PoseOfMost | None:
-        """The pose by known points (ascending ids); None if they do not tell it."""
+        """The pose by known points in the world; None if they do not tell it."""
         seen, mounted = frame.cameras[0], self._rig.cameras[0]
-        rows = is_in(seen.ids, known.ids)
-        found = known.subset(np.searchsorted(known.ids, seen.ids[rows]))
+        rows, found = known.seen(seen.ids)
         if np.count_nonzero(found.located) < self._min_points:
             return None
         rays = _unrolled(seen.normalized[rows], seen.pixels[rows, 1], mounted, rate)

@@ -12,7 +12,6 @@ import gtsam
 import numpy as np
 
 from slam_graph.arrays import IntArray
-from slam_graph.backend.cost.feature_tracks import is_in
 from slam_graph.backend.dynamics import bias_covariance
 from slam_graph.backend.engine_protocol import EngineContext
 from slam_graph.backend.initialization.first_state import start_from
@@ -90,10 +89,7 @@ class VisualStart:
     def _motion(self, before: FeatureFrame, now: FeatureFrame) -> gtsam.Pose3 | Refusal:
         """The motion before_T_now of the body, or what is missing for it."""
         rig, seen = self._context.rig, now.cameras[0]
-        known = depths_within(before, rig)
-        known = known.subset(np.argsort(known.ids))
-        rows = is_in(seen.ids, known.ids)
-        found = known.subset(np.searchsorted(known.ids, seen.ids[rows]))
+        rows, found = depths_within(before, rig).seen(seen.ids)
         count, least = np.count_nonzero(found.located), self._context.config.dynamics.min_points
         if count < least:
             return Refusal(
