@@ -42,7 +42,7 @@ Size = tuple[int, int]
 
 
 class ImageFile:
-    """The bytes of an image file."""
+    """What is done with the bytes of an image file."""
 
     @staticmethod
     def decode(data: bytes, flags: int) -> NDArray[Any] | str:

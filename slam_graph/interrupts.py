@@ -152,10 +152,11 @@ def _pass_on(signum: int, frame: FrameType | None) -> None:
 
 
 def end_with(pipe: int) -> None:
-    """End this process when the other end of a pipe is closed, as by Ctrl-C.
+    """End this process by SIGTERM when the other end of a pipe is closed.
 
     The process that holds that end need not do anything: it is closed also when it is killed.
-    Needs `terminate_like_interrupt`: a background job of a shell ignores SIGINT.
+    Needs `terminate_like_interrupt`, which makes that an orderly end: a background job of a shell
+    ignores SIGINT.
 
     Args:
         pipe: file descriptor to read from; nothing is ever written to it.

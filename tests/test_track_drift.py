@@ -15,7 +15,7 @@ from slam_graph.backend.backend_config import NoiseConfig
 from slam_graph.backend.cost.feature_tracks import Observations
 from slam_graph.backend.cost.pixel_noise import PixelNoise
 from slam_graph.backend.cost.reprojection import Geometry, RigProjection
-from slam_graph.backend.cost.track_drift import EVERY_FRAMES, TrackDrift, slide_features
+from slam_graph.backend.cost.track_drift import EVERY_FRAMES, TrackDrift, add_drift_noise
 from slam_graph.backend.solve.square_root import Layout, SquareRootInformation, triangularize
 from slam_graph.backend.solve.state import State, landmark_keys
 from slam_graph.backend.window import Window
@@ -87,7 +87,7 @@ def test_points_slide_across_their_rays_and_as_far_as_is_said() -> None:
         ids[:4], rig(CAMERAS).cameras[0].camera.pixels(normalized), normalized
     )
     window.tracks.add(EVERY_FRAMES, FeatureFrame(0, (FeatureObservations.empty(), seen)[::-1]))
-    slide_features(window, projection, sigma_px)
+    add_drift_noise(window, projection, sigma_px)
     keys = landmark_keys(ids)
     added = window.prior.covariance_of(keys) - prior.covariance_of(keys)
     at = Geometry(*state.poses((EVERY_FRAMES,)), points)

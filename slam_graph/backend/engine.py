@@ -12,7 +12,7 @@ import numpy as np
 from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.backend.cost.construction import ConstructedCost, CostConstruction
 from slam_graph.backend.cost.cost import Cost
-from slam_graph.backend.cost.track_drift import slide_features
+from slam_graph.backend.cost.track_drift import add_drift_noise
 from slam_graph.backend.engine_protocol import EngineContext, StepReport
 from slam_graph.backend.marginalization.marginalize import marginalize_step
 from slam_graph.backend.solve.gauss_newton import Minimum, minimize
@@ -35,7 +35,7 @@ class SquareRootEngine:
             context.config,
             context.diagnostics,
             context.pixels,
-            without_prediction=context.config.dynamics.start_at_images and not context.rig.has_imu,
+            by_consensus=context.config.dynamics.start_at_images and not context.rig.has_imu,
         )
         self._posterior: SquareRootInformation | None = None
         self._cost: Cost | None = None
@@ -51,7 +51,7 @@ class SquareRootEngine:
             context.add_observations(window, frame)
         with report.timed("cost"):
             if not still:
-                slide_features(window, context.projection, context.pixels.drift.sigma_px)
+                add_drift_noise(window, context.projection, context.pixels.drift.sigma_px)
                 window.recall_features()
             constructed = self._construction.construct(window, still)
         with report.timed("gauss_newton"):

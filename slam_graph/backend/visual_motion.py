@@ -25,6 +25,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from slam_graph.arrays import BoolArray, FloatArray, IntArray
+from slam_graph.backend.backend_config import TriangulationConfig
 from slam_graph.backend.cost.feature_tracks import is_in
 from slam_graph.backend.cost.triangulation import triangulate_frames
 from slam_graph.geometry import NavState
@@ -35,8 +36,9 @@ ERROR_PX = 4.0
 _ERRORS_PX, _SHARES = (1.5, 2.5, ERROR_PX), (0.65, 0.65, 0.5)
 """Limits of the errors, which are tried in turn, and the part of the points that must fit: what
 moves slowly, or is near, would fit a motion between its own and that of the platform."""
-_NEAREST_M, _FAR_M = 0.1, 75.0
-"""Two cameras that see no parallax tell a direction: the feature is taken to be far away."""
+_ACCEPTED = TriangulationConfig()
+"""Depths that `triangulate_frames` accepts. A feature whose parallax is not positive is put at the
+largest one."""
 _SAME_NS = 5_000_000
 """The last frame is used if the time since it is that since the last state, to so much."""
 _ROUNDS = 3
@@ -51,7 +53,7 @@ class KnownPoints:
         ids: (N,).
         points: (N, 3) m, in the frame that is said where it is made.
         located: (N,) whether the depth is known well. Else it is that of too little parallax, or
-            75 m where the parallax is not positive.
+            `max_depth_m` where the parallax is not positive.
     """
 
     ids: IntArray
@@ -233,8 +235,10 @@ def depths_within(frame: FeatureFrame, rig: Rig, rate: FloatArray | None = None)
     rays = np.column_stack([seen.normalized, np.ones(len(twice))])[twice]
     camera = mounted.body_T_camera
     depths = np.asarray(camera.transformTo(found.points[twice].T))[2]
-    usable = found.good[twice] | ((depths > _NEAREST_M) & (depths < _FAR_M))
-    far = np.asarray(camera.transformFrom(_FAR_M * rays.T)).T
+    usable = found.good[twice] | (
+        (depths > _ACCEPTED.min_depth_m) & (depths < _ACCEPTED.max_depth_m)
+    )
+    far = np.asarray(camera.transformFrom(_ACCEPTED.max_depth_m * rays.T)).T
     points = np.where(usable[:, None], found.points[twice], far)
     known = KnownPoints(seen.ids[twice], points, found.good[twice])
     if rate is not None and mounted.readout_s != 0.0:

@@ -35,11 +35,14 @@ class _Kept:
         features: what was found in it.
         imu: the samples since the one before.
         rejected: ids (N,) of the features that were rejected by the gate since then.
+        judged: whether it was known what moves by itself: there was a state, or no objects are
+            estimated.
     """
 
     features: FeatureFrame
     imu: ImuData
     rejected: IntArray
+    judged: bool
 
 
 class KeptFrames:
@@ -54,7 +57,6 @@ class KeptFrames:
         """
         self._objects = objects
         self._frames: deque[_Kept] = deque()
-        self._unjudged: set[int] = set()  # stamps of frames in which nothing says what moves
         self._since: list[tuple[ImuData, IntArray]] = []
         self._pairs: deque[CameraFrame] | None = deque(maxlen=_PAIRS) if pairs else None
 
@@ -72,9 +74,8 @@ class KeptFrames:
         """
         if not self._frames:
             return []
-        frames = [kept.features for kept in self._frames]
-        judged = [frame for frame in frames if frame.stamp_ns not in self._unjudged] or frames
-        still = [frame.without(self._objects.moved) for frame in judged]
+        judged = [kept for kept in self._frames if kept.judged] or self._frames
+        still = [kept.features.without(self._objects.moved) for kept in judged]
         since = [ids for _, ids in self._since]
         rejected = np.unique(np.concatenate([*(kept.rejected for kept in self._frames), *since]))
         left = [frame.without(rejected) for frame in still]
@@ -105,9 +106,8 @@ class KeptFrames:
             return
         samples, rejected = zip(*self._since, strict=True)
         since = ImuData.concatenate(samples), np.concatenate(rejected)
-        frames.append(_Kept(frame.features, *since))
-        if frame.objects is not None and frame.state is None:
-            self._unjudged.add(stamp_ns)
+        judged = frame.objects is None or frame.state is not None
+        frames.append(_Kept(frame.features, *since, judged))
         self._since = []
         while frames[0].features.stamp_ns < stamp_ns - KEPT_NS:
             frames.popleft()

@@ -58,8 +58,8 @@ def camera_pose(
     for refined in range(_TIGHTENED if tightened else 1):
         if tightened:
             errors = _errors(points, rays, rotation, translation)
-            near = errors[errors < error]
-            limit = min(error, _MAX_MEDIANS * float(np.median(near))) if len(near) else 0.0
+            fitting = errors[errors < error]
+            limit = min(error, _MAX_MEDIANS * float(np.median(fitting))) if len(fitting) else 0.0
             tighter = np.flatnonzero(errors < limit)
             if len(tighter) >= max(least, _FEWEST):
                 chosen = tighter

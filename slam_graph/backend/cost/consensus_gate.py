@@ -27,17 +27,22 @@ from slam_graph.backend.cost.robust_loss import MEDIAN_2D, WIDTH_2D
 from slam_graph.backend.solve.square_root import SquareRootInformation
 
 _FEWEST, _LEAST_SHARE = 10, 0.5
-"""Where fewer features fit, or a smaller part of them, there is no consensus. The nearest third of
-them is taken away after that."""
+"""Where fewer features fit, or a smaller part of all, there is no consensus. Counted before the
+nearest third is left out."""
 _NEAREST = 1.0 / 3.0
-"""Part of the features that fit which is near, and no part of the consensus."""
+"""Part of the features that fit, the nearest ones, that is left out of the consensus."""
 _CONFIDENCE = 0.999
 """Share of features at rest that pass the second test, of those that are not of the consensus."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Consensus:
-    """Observations of features of the state (N,), and new features (J,), that the pose is by."""
+    """What updates the prediction before the second test.
+
+    Attributes:
+        landmarks: (N,) which observations of features of the state.
+        tracks: (J,) which new features.
+    """
 
     landmarks: BoolArray
     tracks: BoolArray

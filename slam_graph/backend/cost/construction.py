@@ -113,7 +113,7 @@ class CostConstruction:
         config: BackendConfig,
         diagnostics: Diagnostics,
         pixels: PixelNoise,
-        without_prediction: bool = False,
+        by_consensus: bool = False,
     ) -> None:
         """Take what all steps have in common.
 
@@ -123,7 +123,8 @@ class CostConstruction:
             config: settings that do not depend on the algorithm.
             diagnostics: counts what is rejected.
             pixels: the noise of observations.
-            without_prediction: whether nothing but images tells the pose of a new frame.
+            by_consensus: whether the gate compares features with the motion that most agree on,
+                as nothing but images tells the pose of a new frame.
         """
         self.policy = policy
         self.rig = rig
@@ -135,7 +136,7 @@ class CostConstruction:
         self._selection = FeatureSelection(policy, rig, config, diagnostics, pixels)
         self._select_poses = POSE_SELECTIONS[policy.past_poses]
         self._loss = RobustLoss(config.gating.loss)
-        self._without_prediction = without_prediction
+        self._by_consensus = by_consensus
         self._failures: dict[int, int] = {}
 
     def construct(self, window: Window, still: bool) -> ConstructedCost:
@@ -325,7 +326,7 @@ class CostConstruction:
         """What passes the χ² test, by the prediction or by what most features show."""
         if self._loss.vanishes:
             linear = linear.unweighted(self._loss)
-        if self._without_prediction:
+        if self._by_consensus:
             return gate_by_consensus(cost, linear, predicted, tested)
         return cost.gate(linear, predicted, tested)
 

@@ -108,8 +108,8 @@ class PixelNoise:
             stamp_ns: time of the step.
         """
         self._steps += 1
-        forget = self._forgotten(stamp_ns)
-        self._dof, self._squares = forget * self._dof, forget * self._squares
+        kept = self._kept_since_last(stamp_ns)
+        self._dof, self._squares = kept * self._dof, kept * self._squares
         if tracks is None:
             return
         telling = tracks.obs.counts >= _MIN_OBSERVATIONS
@@ -128,8 +128,8 @@ class PixelNoise:
             obs, rows = tracks.obs.subset(passed), passed[tracks.obs.feature]
             self.drift.learn(obs, residuals[rows], by_point[rows], self._tracking, stamp_ns)
 
-    def _forgotten(self, stamp_ns: int) -> float:
-        """What is left of the weight of tracks since the last step."""
+    def _kept_since_last(self, stamp_ns: int) -> float:
+        """Factor on the weight of earlier tracks, exp(-Δt / memory); 1 in the first step."""
         last, self._stamp_ns = self._stamp_ns, stamp_ns
         return 1.0 if last is None else float(np.exp(-(stamp_ns - last) * 1e-9 / _MEMORY_S))
 

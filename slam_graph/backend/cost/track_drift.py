@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""How far tracks slide off their points: estimated on the way, and as noise of features.
+"""Drift of tracks: estimated on the way, and process noise of the features of the state.
 
 Lucas and Kanade's method follows a patch from frame to frame, so that its small errors add up: the
 track does a random walk around the projection of its point, the same in all cameras, as each of
@@ -40,7 +40,7 @@ from slam_graph.kernels.feature_sums import block_sums
 _LEAST_VARIANCE = 1e-6
 """Of white noise, px²: simulated tracks may have none."""
 EVERY_FRAMES = 6
-"""Features slide once in so many frames, for as many frames: it takes time."""
+"""Process noise is added once in so many frames, for as many frames: it takes time."""
 _BLOCKS = (1, 8)
 """Consecutive observations of a camera that are averaged."""
 _MEMORY_S = 20.0
@@ -133,10 +133,10 @@ def _nonnegative(traces: FloatArray, squares: FloatArray) -> FloatArray:
     return np.array([max(noise, 1e-3 * white), drift]) if drift > 0.0 else np.array([white, 0.0])
 
 
-def slide_features(window: Window, rig: RigProjection, sigma_px: float) -> None:
-    """Let the features of the state that have waiting observations slide since the last time.
+def add_drift_noise(window: Window, rig: RigProjection, sigma_px: float) -> None:
+    """Add the process noise of drift to the features of the state with waiting observations.
 
-    A lost feature is stored as a conditional given other variables where they were then. Sliding
+    A lost feature is stored as a conditional given other variables where they were then. The noise
     makes it outdated, so the store is closed for good.
 
     Args:
