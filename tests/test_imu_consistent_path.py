@@ -15,12 +15,13 @@ from slam_graph.errors import DataError
 from slam_graph.geometry import Trajectory
 from slam_graph.sensors import ImuData
 from slam_graph.simulation import simulate
-from slam_graph.simulation.imu_consistent_path import consistent_path
+from slam_graph.simulation.imu_consistent_path import consistent_path, truth_delay_s
 from slam_graph.simulation.path_report import PathReport
 from slam_graph.simulation.simulated_sequence import Flight
 
 JUMP_AT_S, DRIFT_S, JUMP_M = 12.0, 1.5, 0.08
 OFFSET_RAD = np.deg2rad(1.0)
+LATE_S = 0.02
 
 
 def flown() -> tuple[Flight, Trajectory, ImuData]:
@@ -35,7 +36,7 @@ def flown() -> tuple[Flight, Trajectory, ImuData]:
 
 
 def as_tracked(path: Trajectory) -> Trajectory:
-    """The path as a tracker reports it: noise, a drift that ends in a jump, a turned body."""
+    """The path as a tracker reports it: late, with noise, a drift and jump, a turned body."""
     rng = np.random.default_rng(100)
     seconds = (path.stamps_ns - path.stamps_ns[0]) * 1e-9
     drift = np.clip((seconds - JUMP_AT_S + DRIFT_S) / DRIFT_S, 0.0, None)
@@ -43,7 +44,7 @@ def as_tracked(path: Trajectory) -> Trajectory:
     positions = path.positions + rng.normal(size=path.positions.shape) * 1e-3
     positions[:, 0] += JUMP_M * drift
     turned = Rotation.from_quat(path.quaternions) * Rotation.from_rotvec([OFFSET_RAD, 0.0, 0.0])
-    return Trajectory(path.stamps_ns, positions, turned.as_quat())
+    return Trajectory(path.stamps_ns + round(LATE_S * 1e9), positions, turned.as_quat())
 
 
 def distances(path: Trajectory, found: Trajectory) -> NDArray[np.float64]:
@@ -65,6 +66,7 @@ def test_drift_and_jump_of_the_truth_are_found_and_not_flown() -> None:
     assert len(report.jumps_ns) == 1
     assert report.jumps_m[0] == pytest.approx(JUMP_M, abs=5e-3)
     assert np.rad2deg(np.linalg.norm(report.rotation_offset_rad)) == pytest.approx(1.0, abs=0.1)
+    assert report.late_s == pytest.approx(LATE_S, abs=1e-3)
     assert imu_is_honest(report)
     error = distances(path, found)
     drifting = (seconds > JUMP_AT_S - DRIFT_S - 1.0) & (seconds < JUMP_AT_S + 1.0)
@@ -85,6 +87,14 @@ def test_gaps_of_the_truth_are_bridged_by_the_imu() -> None:
     assert report.bridged_s == pytest.approx(2.0, abs=0.02)
     at = (found.stamps_ns - found.stamps_ns[0]) * 1e-9
     assert np.max(distances(path, found)[(at > 8.0) & (at < 10.0)]) < 0.02
+
+
+@pytest.mark.parametrize("late_s", [0.0, 2e-3, -0.03])
+def test_the_clock_of_the_truth_is_found_unless_it_is_little_off(late_s: float) -> None:
+    flight, path, imu = flown()
+    truth = replace(path, stamps_ns=path.stamps_ns + round(late_s * 1e9))
+    expected = late_s if abs(late_s) > 5e-3 else 0.0
+    assert truth_delay_s(truth, imu, flight.rig.imu) == pytest.approx(expected, abs=1e-3)
 
 
 def test_what_cannot_be_joined_is_an_error() -> None:
@@ -112,6 +122,7 @@ def test_a_machine_hall_flight_has_no_jumps(data_dir: Path) -> None:
     assert report is not None
     assert len(report.jumps_ns) == 2
     assert np.max(report.jumps_m) == pytest.approx(0.13, abs=5e-3)
+    assert 0.02 < report.late_s < 0.04  # 24 ms in all, more in this part, where it jumps
     assert imu_is_honest(report)
     assert report.position_p95_m < 0.02
     raw = read_groundtruth(data_dir / "euroc_inertial" / "MH_04_difficult")

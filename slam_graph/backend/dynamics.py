@@ -40,7 +40,7 @@ _STATE_FEATURE_FRAMES = 2
 """Features enter the state when so many frames have seen them: without an IMU they are what holds
 the pose from frame to frame."""
 
-_MORE_FEATURES, _MORE_WITH_DEPTH = 1.5, 2.5
+_MORE_FEATURES, _MORE_WITH_DEPTH = 1.25, 2.5
 """How many times as many features are held in the state as with an IMU. By two cameras far points
 are known less exactly than a filter can linearise: with 2.5 times the NEES of stereo doubles."""
 

@@ -4,10 +4,11 @@
 
 A ground truth is not the path that an IMU measured: that of a laser tracker drifts while the
 tracker has lost its prism and then jumps back, that of motion capture has gaps, and both differ
-from the IMU in orientation. A camera that is simulated along it would be teleported. So the path
-is the least-squares solution of preintegrated IMU factors (Forster et al. 2017) and the positions
-and orientations of the ground truth, in which a Cauchy loss on the positions rejects stretches
-that no motion explains (Barfoot 2017, section 5.3).
+from the IMU in orientation and in their clock. A camera that is simulated along it would be
+teleported. So the path is the least-squares solution of preintegrated IMU factors (Forster et al.
+2017) and the positions and orientations of the ground truth, in which a Cauchy loss on the
+positions rejects stretches that no motion explains (Barfoot 2017, section 5.3). The clock of the
+ground truth is estimated first, as the time offset under which this problem has its least cost.
 
 The solution itself would follow every sample of the IMU, noise included, and an estimator would
 find the IMU better than it is. So white noise of the densities of the calibration is drawn and
@@ -18,9 +19,12 @@ difference between recorded samples and path is white and of the size that the c
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import B, V, X
+from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation, Slerp
 
 from slam_graph.arrays import FloatArray
@@ -57,12 +61,63 @@ _LONGEST_GAP_S = 2.5
 
 _ITERATIONS = 15
 
+_LATE_SIGMA_S, _LATEST_S = 0.02, 0.1
+"""Standard deviation of the time offset of a ground truth before it is estimated, and its bound."""
+
+_LATE_COST, _LATE_SLOPE = 1e-4, 0.5
+"""The time offset is found when the cost changes by less than this part of it, or by less than
+this per millisecond: a tenth to a fifth of σ."""
+
+_LATE_NOTED_S = 5e-3
+"""Smaller time offsets are not told from other errors of the truth, which move what is found in
+parts of one flight by up to 3.5 ms (V2_01, V2_02). They are left as they are."""
+
 _OFFSET_ROUNDS = 10
 _OFFSET_CONVERGED_RAD = np.deg2rad(0.02)
 """The constant rotation between truth and IMU, and the states, are estimated in turn."""
 
 _NOISE_STREAM = 20260101
 """Seed of the noise: a recorded flight has one path, whatever the seed of the simulation."""
+
+
+def truth_delay_s(truth: Trajectory, imu: ImuData, noise: ImuNoise) -> float:
+    """How much later the times of a ground truth are than those of the IMU; 0 below 5 ms.
+
+    The cost of the best path is a function of this delay alone. Its slope is that of the cost of
+    the positions on a path that stays, as the path is a minimum.
+
+    Args:
+        truth: recorded poses of the body (the IMU), at some tens per second or more.
+        imu: recorded samples; the time that both cover counts.
+        noise: calibrated densities of the IMU.
+
+    Raises:
+        DataError: as `consistent_path` does.
+    """
+    offset = Rotation.identity()
+
+    def cost(late_ms: FloatArray) -> tuple[float, FloatArray]:
+        nonlocal offset
+        late_s = 1e-3 * float(late_ms[0])
+        moved = _earlier(truth, late_s)
+        first, last = _overlap(moved, imu)
+        batch = _Batch(moved, imu[first:last], imu[first:last], noise)
+        states, offset = batch.solve_with_offset(offset, 2)
+        value, slope = batch.cost(states)
+        value += 0.5 * (late_s / _LATE_SIGMA_S) ** 2
+        return value, np.array([1e-3 * (slope + late_s / _LATE_SIGMA_S**2)])
+
+    bound = 1e3 * _LATEST_S
+    found = minimize(
+        cost,
+        np.zeros(1),
+        jac=True,
+        method="L-BFGS-B",
+        bounds=[(-bound, bound)],
+        options={"ftol": _LATE_COST, "gtol": _LATE_SLOPE},
+    )
+    late_s = 1e-3 * float(found.x[0])
+    return late_s if abs(late_s) >= _LATE_NOTED_S else 0.0
 
 
 def consistent_path(
@@ -82,16 +137,17 @@ def consistent_path(
     Raises:
         DataError: if they overlap for less than a second, or a gap of the truth is too long.
     """
+    late_s = truth_delay_s(truth, imu, noise)
+    truth = _earlier(truth, late_s)
     first, last = _overlap(truth, imu)
     batch = _Batch(truth, imu[first:last], _with_noise(imu, noise)[first:last], noise)
-    offset = Rotation.identity()
-    for _ in range(_OFFSET_ROUNDS):
-        states = batch.solve(offset)
-        before, offset = offset, batch.rotation_offset(states)
-        if (before.inv() * offset).magnitude() < _OFFSET_CONVERGED_RAD:
-            break
+    states, offset = batch.solve_with_offset(Rotation.identity(), _OFFSET_ROUNDS)
     path = batch.path(states)
-    return path, report_on(truth, path, batch.imu, noise, offset)
+    return path, report_on(truth, path, batch.imu, noise, offset, late_s)
+
+
+def _earlier(truth: Trajectory, by_s: float) -> Trajectory:
+    return replace(truth, stamps_ns=truth.stamps_ns - round(by_s * 1e9))
 
 
 def _overlap(truth: Trajectory, imu: ImuData) -> tuple[int, int]:
@@ -139,7 +195,29 @@ class _Batch:
         self._imu_factors = self._between_states()
         self._measured = self._used_rows()
 
-    def solve(self, offset: Rotation) -> _States:
+    def solve_with_offset(self, offset: Rotation, rounds: int) -> tuple[_States, Rotation]:
+        """States and the rotation path_R_truth of the body, in turn, from a guess of the latter."""
+        for _ in range(rounds):
+            states = self._solve(offset)
+            before, offset = offset, self._rotation_offset(states)
+            if (before.inv() * offset).magnitude() < _OFFSET_CONVERGED_RAD:
+                break
+        return states, offset
+
+    def cost(self, states: _States) -> tuple[float, float]:
+        """Cost of IMU and positions, and its slope over how late the ground truth is, 1/s."""
+        rows, indices = (np.array(column) for column in zip(*self._measured, strict=True))
+        delays = self._state_times()[indices] - self._truth_times()[rows]
+        velocities = np.array([states.values.atVector(V(k)) for k in indices])
+        there = self.truth.positions[rows] + velocities * delays[:, None]
+        residuals = (states.positions[indices] - there) / _POSITION_SIGMA_M
+        squares = np.einsum("ni,ni->n", residuals, residuals) / _CAUCHY_WIDTH**2
+        weighted = residuals / (_POSITION_SIGMA_M * (1.0 + squares[:, None]))
+        cost = self._imu_factors.error(states.values)
+        cost += 0.5 * _CAUCHY_WIDTH**2 * float(np.sum(np.log1p(squares)))
+        return cost, -float(np.sum(weighted * velocities))
+
+    def _solve(self, offset: Rotation) -> _States:
         """The optimum; `offset` is path_R_truth of the body."""
         graph = gtsam.NonlinearFactorGraph(self._imu_factors)
         graph.add(
@@ -154,9 +232,7 @@ class _Batch:
         rotation = gtsam.noiseModel.Isotropic.Sigma(3, _ROTATION_SIGMA_RAD)
         turned = (Rotation.from_quat(self.truth.quaternions) * offset.inv()).as_matrix()
         for row, state in self._measured:
-            delay_s = self._state_times()[state] - (
-                (self.truth.stamps_ns[row] - self.imu.stamps_ns[0]) * 1e-9
-            )
+            delay_s = self._state_times()[state] - self._truth_times()[row]
             velocity = self._start.atVector(V(state))
             there = self.truth.positions[row] + velocity * delay_s
             graph.add(gtsam.PoseTranslationPrior3D(X(state), there, position))
@@ -169,7 +245,7 @@ class _Batch:
         self._start = values
         return _States(values, len(self._rows))
 
-    def rotation_offset(self, states: _States) -> Rotation:
+    def _rotation_offset(self, states: _States) -> Rotation:
         """Mean rotation path_R_truth of the body."""
         rows, indices = (np.array(column) for column in zip(*self._measured, strict=True))
         truth = Rotation.from_quat(self.truth.quaternions[rows])
@@ -221,10 +297,14 @@ class _Batch:
         times: FloatArray = self._seconds[self._rows]
         return times
 
+    def _truth_times(self) -> FloatArray:
+        times: FloatArray = (self.truth.stamps_ns - self.imu.stamps_ns[0]) * 1e-9
+        return times
+
     def _initial(self) -> gtsam.Values:
         """States from the ground truth: interpolated poses, velocities of its central parts."""
         at = self._state_times()
-        seconds = (self.truth.stamps_ns - self.imu.stamps_ns[0]) * 1e-9
+        seconds = self._truth_times()
         columns = self.truth.positions.T
         positions = np.stack([np.interp(at, seconds, column) for column in columns], axis=1)
         ahead, behind = at + _STATE_SPACING_S, at - _STATE_SPACING_S
@@ -255,7 +335,7 @@ class _Batch:
 
     def _used_rows(self) -> list[tuple[int, int]]:
         """Poses of the ground truth that are measurements, each with the nearest state."""
-        seconds, at = (self.truth.stamps_ns - self.imu.stamps_ns[0]) * 1e-9, self._state_times()
+        seconds, at = self._truth_times(), self._state_times()
         wanted = np.arange(at[0], at[-1], _MEASUREMENT_SPACING_S)
         rows = np.unique(np.searchsorted(seconds, wanted).clip(0, len(seconds) - 1))
         after = np.searchsorted(at, seconds[rows]).clip(1, len(at) - 1)

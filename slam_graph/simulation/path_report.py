@@ -31,6 +31,8 @@ class PathReport:
     Attributes:
         jumps_ns, jumps_m: (J,) times and sizes of the jumps of the ground truth.
         bridged_s: total length of the gaps of the ground truth.
+        late_s: how much later the times of the ground truth are than those of the IMU, which is
+            corrected; 0 if it is little.
         position_rms_m, position_p95_m, position_max_m: distance from the ground truth where it does
             not jump.
         rotation_offset_rad: (3,) constant rotation path_R_truth of the body.
@@ -43,6 +45,7 @@ class PathReport:
     jumps_ns: IntArray
     jumps_m: FloatArray
     bridged_s: float
+    late_s: float
     position_rms_m: float
     position_p95_m: float
     position_max_m: float
@@ -67,7 +70,9 @@ class PathReport:
         if len(self.jumps_m):
             jumps = f"{len(self.jumps_m)}, the largest of {1e3 * np.max(self.jumps_m):.0f} mm"
         offset = float(np.rad2deg(np.linalg.norm(self.rotation_offset_rad)))
+        late = f"{1e3 * abs(self.late_s):.0f} ms {'late' if self.late_s > 0.0 else 'early'}"
         return {
+            "clock of the truth": f"{late}, corrected" if self.late_s else "as the IMU's",
             "jumps of the truth": jumps,
             "path to truth": f"{1e3 * self.position_rms_m:.1f} mm rms, 95 % within "
             f"{1e3 * self.position_p95_m:.0f} mm, {1e3 * self.position_max_m:.0f} mm at most; "
@@ -80,16 +85,22 @@ class PathReport:
 
 
 def report_on(
-    truth: Trajectory, path: Trajectory, imu: ImuData, noise: ImuNoise, offset: Rotation
+    truth: Trajectory,
+    path: Trajectory,
+    imu: ImuData,
+    noise: ImuNoise,
+    offset: Rotation,
+    late_s: float,
 ) -> PathReport:
     """How a path differs from the ground truth and the IMU that it was estimated from.
 
     Args:
-        truth: the recorded poses.
+        truth: the recorded poses, at the times of the IMU.
         path: at the times of the samples, with velocities and biases.
         imu: the recorded samples.
         noise: calibrated densities of the IMU.
         offset: constant rotation path_R_truth of the body.
+        late_s: how much later the times of the recorded poses were.
     """
     seconds = (path.stamps_ns - path.stamps_ns[0]) * 1e-9
     at = (truth.stamps_ns - path.stamps_ns[0]) * 1e-9
@@ -112,6 +123,7 @@ def report_on(
         stamps[jumps],
         steps[jumps],
         float(np.sum(gaps)),
+        late_s,
         float(np.sqrt(np.mean(distance**2))),
         float(np.percentile(distance, 95)),
         float(np.max(distance)),
