@@ -130,6 +130,10 @@ class FrontendConfig(Settings):
     subpixel: bool = expert(False)
     """Whether new keypoints are refined to a fraction of a pixel."""
 
+    reference_patches: bool = expert(True)
+    """Whether a tracked corner is placed by the patch of the image in which it was first seen, so
+    that its track does not drift."""
+
     verify_new: bool = expert(True)
     """Whether a new feature must also be found in the image before."""
 

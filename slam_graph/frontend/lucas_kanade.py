@@ -17,13 +17,14 @@ from slam_graph.frontend.extraction import BORDER_PX, FeatureExtractor
 from slam_graph.frontend.frontend_config import FrontendConfig
 from slam_graph.frontend.keypoints import Image, Pixels, Tracks
 from slam_graph.frontend.prediction import Prediction, neighbour_flow
+from slam_graph.frontend.reference_patches import ReferencePatches
 from slam_graph.kernels.halvings import halved, halvings_room
 from slam_graph.kernels.window_tracking import WINDOW_PX, track_windows
 
 _ITERATIONS = 15
 """Most iterations on each level of the pyramid; few are needed from a good prediction."""
 
-_STEP_PX = 0.02
+_STEP_PX = 0.05
 """Iterations end when a step is smaller than this, which is well below the noise of a track."""
 
 _CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, _ITERATIONS, _STEP_PX)
@@ -195,6 +196,7 @@ class CornerTracking:
         self._lucas_kanade = lucas_kanade
         self._levels = config.pyramid_levels
         self._largest_px = config.forward_backward_px
+        self._patches = ReferencePatches() if config.reference_patches else None
 
     def follow(self, before: Tracks, image: Image, guess: Prediction) -> Association:
         """Find features in the next image."""
@@ -215,6 +217,8 @@ class CornerTracking:
             good[rows] = flow.found & (
                 flow.error_px < self._tolerance_px(before.pixels[rows], flow.points)
             )
+        if self._patches is not None and n > 0:
+            points = self._patches.placed(before, image, points, good)
         return Association(points, good, {"lost_klt": ~found, "lost_fb": found & ~good})
 
     def recover(self, before: Tracks, after: Tracks) -> tuple[IntArray, Pixels]:

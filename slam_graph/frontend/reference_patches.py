@@ -1,0 +1,176 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""Features placed by the patch in which they were first seen, so that their tracks do not drift.
+
+Lucas-Kanade from image to image adds the error of each image to those before: after twenty images
+a track is several tenths of a pixel beside its corner. So each feature keeps the patch around it of
+its first image. What Lucas-Kanade found is refined until the new image shows that patch, under an
+affine warp that follows the change of view (as SVO does: Forster, Pizzoli & Scaramuzza 2014,
+section IV.B; the warp is estimated here, where SVO takes it from the map). Where that fails, or the
+view has changed too much, the feature stays where it was tracked to, with a new patch from there.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slam_graph.arrays import BoolArray, FloatArray, IntArray
+from slam_graph.frontend.association import inside
+from slam_graph.frontend.keypoints import Image, Pixels, Tracks
+from slam_graph.kernels.ascending import are_among
+from slam_graph.kernels.patch_alignment import PATCH_PX, ROW_PX, align_patches
+
+_ITERATIONS, _STEP_PX = 2, 0.05
+"""Most steps, and a step that is the last one: Lucas-Kanade leaves little to do."""
+_FARTHEST_PX = 1.5
+_LEAST_CORRELATION = 0.8
+"""What moved farther, or is less alike, is not taken for the same patch."""
+_SMALLEST, _LARGEST = 0.4, 2.5
+"""Change of the area of a patch beyond which a new one shows more."""
+_WARP_NOISE_GREY = 2.0
+"""Noise of the image against which a warp by a pixel at the edge of a patch is held: where a patch
+does not show its warp, that stays."""
+_LEAST_DEVIATION = 1.0
+"""A patch with less contrast (grey levels) is none."""
+
+_MOST_MISSING = 3
+"""Patches that are kept for each feature that is tracked: of those that are lost, too."""
+
+_HALF, _COUNT = PATCH_PX // 2, PATCH_PX * PATCH_PX
+_ACROSS, _DOWN = np.stack(np.meshgrid(*[np.arange(-_HALF, _HALF + 1)] * 2)).reshape(2, -1) / _HALF
+"""(P,) column and row of each pixel of a patch, from -1 to 1."""
+_LEAST_INFORMATION = 1e-9
+"""Where a patch has gradients along one direction only, the other stays as it is."""
+
+
+class ReferencePatches:
+    """The patches of the features of one camera."""
+
+    def __init__(self) -> None:
+        self._ids: IntArray = np.zeros(0, np.int64)  # ascending
+        self._slots: IntArray = np.zeros(0, np.int64)  # where each of them is in what follows
+        self._free: list[int] = []
+        self._templates = np.zeros((0, 3, PATCH_PX * ROW_PX), np.float32)
+        self._systems: FloatArray = np.zeros((0, 8, 6))
+        self._warps: FloatArray = np.zeros((0, 2, 2))
+
+    def placed(self, before: Tracks, image: Image, points: Pixels, good: BoolArray) -> Pixels:
+        """Pixels (N, 2) of features in a new image, by their patches.
+
+        Args:
+            before: the image before and its features.
+            image: the new one.
+            points: (N, 2) where these were tracked to.
+            good: (N,) which were; others stay where they are.
+        """
+        assert before.image is not None
+        self._make_room(before.ids)
+        new = np.flatnonzero(~are_among(before.ids, self._ids))
+        self._add(before.image, before.ids[new], before.pixels[new])
+        rows = np.flatnonzero(good & are_among(before.ids, self._ids))
+        slots = self._slots[np.searchsorted(self._ids, before.ids[rows])]
+        start = points[rows].astype(np.float64)
+        places = start.copy()
+        found, correlations = align_patches(
+            np.ascontiguousarray(image),
+            *(self._templates, self._systems, self._warps, slots),
+            *(places, _ITERATIONS, _STEP_PX),
+        )
+        (a, b), (c, d) = self._warps[slots].transpose(1, 2, 0)
+        areas = a * d - b * c
+        found &= np.sum((places - start) ** 2, axis=1) < _FARTHEST_PX**2
+        found &= (correlations > _LEAST_CORRELATION) & (areas > _SMALLEST) & (areas < _LARGEST)
+        points = points.copy()
+        points[rows[found]] = places[found]
+        self._remove(are_among(self._ids, before.ids[rows[~found]]))  # new ones in the next image
+        return points
+
+    def _make_room(self, ids: IntArray) -> None:
+        """Forget features other than some, if there are many: a few are found again."""
+        if len(self._ids) > _MOST_MISSING * len(ids) + _MOST_MISSING:
+            self._remove(~are_among(self._ids, ids))
+
+    def _remove(self, which: BoolArray) -> None:
+        self._free += self._slots[which].tolist()
+        self._ids, self._slots = self._ids[~which], self._slots[~which]
+
+    def _add(self, image: Image, ids: IntArray, pixels: Pixels) -> None:
+        """Take the patches around pixels (N, 2) of an image, where it has enough contrast."""
+        within = inside(pixels, image.shape, _HALF + 2)
+        ids, patches = ids[within], _patches(image, pixels[within])
+        deviations = patches[:, 1:-1, 1:-1].std(axis=(1, 2))
+        rich = np.flatnonzero(deviations >= _LEAST_DEVIATION)
+        if len(rich) == 0:
+            return
+        ids, slots = ids[rich], self._taken(len(rich))
+        templates = _templates(patches[rich], deviations[rich])
+        self._templates[slots] = templates.reshape(len(rich), 3, -1)
+        self._systems[slots] = _systems(templates[..., :PATCH_PX], deviations[rich])
+        self._warps[slots] = np.eye(2)
+        ids, slots = np.concatenate([self._ids, ids]), np.concatenate([self._slots, slots])
+        order = np.argsort(ids, kind="stable")
+        self._ids, self._slots = ids[order], slots[order]
+
+    def _taken(self, count: int) -> IntArray:
+        """So many slots that were free; there are more if need be."""
+        had = len(self._templates)
+        if len(self._free) < count:
+            more = max(count, had)
+            self._free += range(had, had + more)
+            self._templates = np.concatenate([self._templates, _empty(more, self._templates)])
+            self._systems = np.concatenate([self._systems, _empty(more, self._systems)])
+            self._warps = np.concatenate([self._warps, _empty(more, self._warps)])
+        taken, self._free = self._free[:count], self._free[count:]
+        return np.array(taken, np.int64)
+
+
+def _patches(image: Image, pixels: Pixels) -> FloatArray:
+    """(N, 17, 17) grey values around pixels (N, 2), between pixels of the image."""
+    corner = pixels.astype(np.float64) - _HALF - 1
+    first = np.floor(corner).astype(np.int64)
+    s, t = (corner - first).T[:, :, None, None]
+    side = np.arange(PATCH_PX + 3)
+    rows, columns = first[:, 1, None] + side, first[:, 0, None] + side
+    grey = image[rows[:, :, None], columns[:, None, :]].astype(np.float64)
+    across = (1.0 - s) * grey[:, :, :-1] + s * grey[:, :, 1:]
+    found: FloatArray = (1.0 - t) * across[:, :-1] + t * across[:, 1:]
+    return found
+
+
+def _templates(patches: FloatArray, deviations: FloatArray) -> NDArray[np.float32]:
+    """(N, 3, 15, 16) normalised patches and their derivatives along columns and rows.
+
+    Args:
+        patches: (N, 17, 17) grey values.
+        deviations: (N,) of the inner ones.
+    """
+    inner = patches[:, 1:-1, 1:-1]
+    found = np.zeros((len(patches), 3, PATCH_PX, ROW_PX), np.float32)
+    found[:, 0, :, :PATCH_PX] = inner - inner.mean(axis=(1, 2), keepdims=True)
+    found[:, 1, :, :PATCH_PX] = 0.5 * (patches[:, 1:-1, 2:] - patches[:, 1:-1, :-2])
+    found[:, 2, :, :PATCH_PX] = 0.5 * (patches[:, 2:, 1:-1] - patches[:, :-2, 1:-1])
+    found /= deviations[:, None, None, None].astype(np.float32)
+    return found
+
+
+def _systems(templates: NDArray[np.float32], deviations: FloatArray) -> FloatArray:
+    """(N, 8, 6) what `align_patches` solves, of templates (N, 3, 15, 15).
+
+    Brightness and contrast are unknown, too, and are eliminated.
+    """
+    T, dx, dy = templates.reshape(len(templates), 3, _COUNT).astype(np.float64).swapaxes(0, 1)
+    J = np.stack([dx, dy, dx * _ACROSS, dx * _DOWN, dy * _ACROSS, dy * _DOWN], axis=1)
+    means, alike = J.mean(axis=2), (J @ T[:, :, None])[:, :, 0] / _COUNT
+    rest = J - means[:, :, None] - alike[:, :, None] * T[:, None, :]
+    held = (_WARP_NOISE_GREY / deviations) ** 2 * _COUNT
+    H = rest @ rest.transpose(0, 2, 1)
+    H[:, range(2, 6), range(2, 6)] += held[:, None]
+    H[:, range(6), range(6)] += _LEAST_INFORMATION
+    return np.concatenate([np.linalg.inv(H), means[:, None], alike[:, None]], axis=1)
+
+
+def _empty(count: int, like: NDArray[Any]) -> NDArray[Any]:
+    return np.zeros((count, *like.shape[1:]), like.dtype)
