@@ -15,6 +15,8 @@ from slam_graph.kernels.epipolar import (
 )
 from slam_graph.kernels.halvings import halved, halvings_room
 from slam_graph.kernels.near_pairs import near_pairs, near_pairs_numpy, nearest, nearest_numpy
+from slam_graph.kernels.patch_alignment import align_patches, align_patches_numpy
+from slam_graph.kernels.patch_templates import fill_templates, fill_templates_numpy
 from slam_graph.kernels.spacing import (
     apart,
     apart_numpy,
@@ -229,3 +231,42 @@ def test_strongest_maxima_are_those_of_opencv(count: int, distance_px: float, le
         opencv = np.column_stack([np.reshape(corners, (-1, 2)), np.ravel(strengths)])
         np.testing.assert_array_equal(found, opencv[opencv[:, 2] >= smallest])
     assert len(strongest_maxima(scores, np.zeros_like(allowed), 9, 0.05, 0.0, 1.0)) == 0
+
+
+@pytest.mark.parametrize("iterations", [1, 2, 20])
+def test_align_patches(iterations: int) -> None:
+    """Patches that are there, beyond an edge, without contrast, and of something else."""
+    rng = np.random.default_rng(iterations)
+    image = rng.integers(0, 256, (120, 160)).astype(np.uint8)
+    image = np.ascontiguousarray(cv2.GaussianBlur(image, (0, 0), 2.0))
+    image[:40, :40] = 90
+    count = 60
+    middles = rng.integers([10, 10], [150, 110], (count, 2)) + rng.uniform(size=(count, 2))
+    filled = []
+    for fill in (fill_templates, fill_templates_numpy):
+        room = (
+            np.zeros((count, 3, 240), np.float32),
+            np.zeros((count, 8, 6)),
+            np.ones((count, 2, 2)),
+        )
+        rich = fill(image, middles.astype(np.float32), np.arange(count)[::-1].copy(), *room)
+        filled.append((rich, *room))
+    for one, other in zip(*filled, strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-9)
+    (rich, templates, systems, _), middles = filled[0], middles[::-1]
+    assert 0 < np.count_nonzero(rich) < count
+    templates[::7] = rng.normal(size=templates[::7].shape)
+    warps = np.eye(2) + rng.normal(0.0, 0.03, (count, 2, 2))
+    rows = rng.permutation(count)[:50]
+    start = middles[rows] + rng.normal(0.0, 0.3, (50, 2))
+    results = []
+    for kernel in (align_patches, align_patches_numpy):
+        points, changed = start.copy(), warps.copy()
+        shared = image, templates, systems, changed, rows, points
+        found, correlations = kernel(*shared, iterations, 0.01)
+        results.append((found, correlations, points, changed))
+    (found, *values), (expected, *others) = results
+    np.testing.assert_array_equal(found, expected)
+    assert 10 < np.count_nonzero(found) < 50
+    for one, other in zip(values, others, strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-9)

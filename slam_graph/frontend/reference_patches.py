@@ -22,6 +22,7 @@ from slam_graph.frontend.association import inside
 from slam_graph.frontend.keypoints import Image, Pixels, Tracks
 from slam_graph.kernels.ascending import are_among
 from slam_graph.kernels.patch_alignment import PATCH_PX, ROW_PX, align_patches
+from slam_graph.kernels.patch_templates import fill_templates
 
 _ITERATIONS, _STEP_PX = 2, 0.05
 """Most steps, and a step that is the last one: Lucas-Kanade leaves little to do."""
@@ -30,20 +31,10 @@ _LEAST_CORRELATION = 0.8
 """What moved farther, or is less alike, is not taken for the same patch."""
 _SMALLEST, _LARGEST = 0.4, 2.5
 """Change of the area of a patch beyond which a new one shows more."""
-_WARP_NOISE_GREY = 2.0
-"""Noise of the image against which a warp by a pixel at the edge of a patch is held: where a patch
-does not show its warp, that stays."""
-_LEAST_DEVIATION = 1.0
-"""A patch with less contrast (grey levels) is none."""
-
 _MOST_MISSING = 3
 """Patches that are kept for each feature that is tracked: of those that are lost, too."""
 
-_HALF, _COUNT = PATCH_PX // 2, PATCH_PX * PATCH_PX
-_ACROSS, _DOWN = np.stack(np.meshgrid(*[np.arange(-_HALF, _HALF + 1)] * 2)).reshape(2, -1) / _HALF
-"""(P,) column and row of each pixel of a patch, from -1 to 1."""
-_LEAST_INFORMATION = 1e-9
-"""Where a patch has gradients along one direction only, the other stays as it is."""
+_HALF = PATCH_PX // 2
 
 
 class ReferencePatches:
@@ -99,17 +90,12 @@ class ReferencePatches:
 
     def _add(self, image: Image, ids: IntArray, pixels: Pixels) -> None:
         """Take the patches around pixels (N, 2) of an image, where it has enough contrast."""
-        within = inside(pixels, image.shape, _HALF + 2)
-        ids, patches = ids[within], _patches(image, pixels[within])
-        deviations = patches[:, 1:-1, 1:-1].std(axis=(1, 2))
-        rich = np.flatnonzero(deviations >= _LEAST_DEVIATION)
-        if len(rich) == 0:
-            return
-        ids, slots = ids[rich], self._taken(len(rich))
-        templates = _templates(patches[rich], deviations[rich])
-        self._templates[slots] = templates.reshape(len(rich), 3, -1)
-        self._systems[slots] = _systems(templates[..., :PATCH_PX], deviations[rich])
-        self._warps[slots] = np.eye(2)
+        within = inside(pixels, image.shape, _HALF + 3)
+        ids, slots = ids[within], self._taken(int(np.count_nonzero(within)))
+        room = self._templates, self._systems, self._warps
+        rich = fill_templates(np.ascontiguousarray(image), pixels[within], slots, *room)
+        self._free += slots[~rich].tolist()
+        ids, slots = ids[rich], slots[rich]
         ids, slots = np.concatenate([self._ids, ids]), np.concatenate([self._slots, slots])
         order = np.argsort(ids, kind="stable")
         self._ids, self._slots = ids[order], slots[order]
@@ -125,51 +111,6 @@ class ReferencePatches:
             self._warps = np.concatenate([self._warps, _empty(more, self._warps)])
         taken, self._free = self._free[:count], self._free[count:]
         return np.array(taken, np.int64)
-
-
-def _patches(image: Image, pixels: Pixels) -> FloatArray:
-    """(N, 17, 17) grey values around pixels (N, 2), between pixels of the image."""
-    corner = pixels.astype(np.float64) - _HALF - 1
-    first = np.floor(corner).astype(np.int64)
-    s, t = (corner - first).T[:, :, None, None]
-    side = np.arange(PATCH_PX + 3)
-    rows, columns = first[:, 1, None] + side, first[:, 0, None] + side
-    grey = image[rows[:, :, None], columns[:, None, :]].astype(np.float64)
-    across = (1.0 - s) * grey[:, :, :-1] + s * grey[:, :, 1:]
-    found: FloatArray = (1.0 - t) * across[:, :-1] + t * across[:, 1:]
-    return found
-
-
-def _templates(patches: FloatArray, deviations: FloatArray) -> NDArray[np.float32]:
-    """(N, 3, 15, 16) normalised patches and their derivatives along columns and rows.
-
-    Args:
-        patches: (N, 17, 17) grey values.
-        deviations: (N,) of the inner ones.
-    """
-    inner = patches[:, 1:-1, 1:-1]
-    found = np.zeros((len(patches), 3, PATCH_PX, ROW_PX), np.float32)
-    found[:, 0, :, :PATCH_PX] = inner - inner.mean(axis=(1, 2), keepdims=True)
-    found[:, 1, :, :PATCH_PX] = 0.5 * (patches[:, 1:-1, 2:] - patches[:, 1:-1, :-2])
-    found[:, 2, :, :PATCH_PX] = 0.5 * (patches[:, 2:, 1:-1] - patches[:, :-2, 1:-1])
-    found /= deviations[:, None, None, None].astype(np.float32)
-    return found
-
-
-def _systems(templates: NDArray[np.float32], deviations: FloatArray) -> FloatArray:
-    """(N, 8, 6) what `align_patches` solves, of templates (N, 3, 15, 15).
-
-    Brightness and contrast are unknown, too, and are eliminated.
-    """
-    T, dx, dy = templates.reshape(len(templates), 3, _COUNT).astype(np.float64).swapaxes(0, 1)
-    J = np.stack([dx, dy, dx * _ACROSS, dx * _DOWN, dy * _ACROSS, dy * _DOWN], axis=1)
-    means, alike = J.mean(axis=2), (J @ T[:, :, None])[:, :, 0] / _COUNT
-    rest = J - means[:, :, None] - alike[:, :, None] * T[:, None, :]
-    held = (_WARP_NOISE_GREY / deviations) ** 2 * _COUNT
-    H = rest @ rest.transpose(0, 2, 1)
-    H[:, range(2, 6), range(2, 6)] += held[:, None]
-    H[:, range(6), range(6)] += _LEAST_INFORMATION
-    return np.concatenate([np.linalg.inv(H), means[:, None], alike[:, None]], axis=1)
 
 
 def _empty(count: int, like: NDArray[Any]) -> NDArray[Any]:
