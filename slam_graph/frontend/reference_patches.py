@@ -26,9 +26,8 @@ from slam_graph.kernels.patch_templates import fill_templates
 
 _ITERATIONS, _STEP_PX = 2, 0.05
 """Most steps, and a step that is the last one: Lucas-Kanade leaves little to do."""
-_FARTHEST_PX = 1.5
 _LEAST_CORRELATION = 0.8
-"""What moved farther, or is less alike, is not taken for the same patch."""
+"""What is less alike is not taken for the same patch."""
 _SMALLEST, _LARGEST = 0.4, 2.5
 """Change of the area of a patch beyond which a new one shows more."""
 _MOST_MISSING = 3
@@ -63,8 +62,7 @@ class ReferencePatches:
         self._add(before.image, before.ids[new], before.pixels[new])
         rows = np.flatnonzero(good & are_among(before.ids, self._ids))
         slots = self._slots[np.searchsorted(self._ids, before.ids[rows])]
-        start = points[rows].astype(np.float64)
-        places = start.copy()
+        places = points[rows].astype(np.float64)
         found, correlations = align_patches(
             np.ascontiguousarray(image),
             *(self._templates, self._systems, self._warps, slots),
@@ -72,7 +70,6 @@ class ReferencePatches:
         )
         (a, b), (c, d) = self._warps[slots].transpose(1, 2, 0)
         areas = a * d - b * c
-        found &= np.sum((places - start) ** 2, axis=1) < _FARTHEST_PX**2
         found &= (correlations > _LEAST_CORRELATION) & (areas > _SMALLEST) & (areas < _LARGEST)
         points = points.copy()
         points[rows[found]] = places[found]

@@ -35,7 +35,7 @@ _at = np.uintp
 _HALF, _COUNT = PATCH_PX // 2, PATCH_PX * PATCH_PX
 _LEAST_DEVIATION = 1.0
 """A window with less contrast (grey levels) has nothing to align."""
-_FARTHEST_PX = 3.0
+_FARTHEST_PX = 1.5
 """A window that leaves its first place by more is another one."""
 _LEAST_SCALE = 0.3
 """A step that shrinks the area of a patch by more than this leads nowhere."""
