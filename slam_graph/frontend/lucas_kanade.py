@@ -247,7 +247,9 @@ class CornerTracking:
         return np.asarray(self._largest_px + self._blur * moved, np.float32)
 
     def accept(self, ids: IntArray, chosen: BoolArray) -> None:
-        """Nothing to remember: corners are found again by their image."""
+        """Nothing to remember: the patch of a corner is taken when it is first followed."""
 
     def forget(self, ids: IntArray) -> None:
-        """Nothing to forget."""
+        """Drop the patches of these."""
+        if self._patches is not None:
+            self._patches.forget(ids)

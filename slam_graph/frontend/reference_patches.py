@@ -64,7 +64,7 @@ class ReferencePatches:
         slots = self._slots[np.searchsorted(self._ids, before.ids[rows])]
         places = points[rows].astype(np.float64)
         found, correlations = align_patches(
-            np.ascontiguousarray(image),
+            _for_kernels(image),
             *(self._templates, self._systems, self._warps, slots),
             *(places, _ITERATIONS, _STEP_PX),
         )
@@ -75,6 +75,10 @@ class ReferencePatches:
         points[rows[found]] = places[found]
         self._remove(are_among(self._ids, before.ids[rows[~found]]))  # new ones in the next image
         return points
+
+    def forget(self, ids: IntArray) -> None:
+        """Drop the patches of features that do not come back."""
+        self._remove(are_among(self._ids, np.sort(ids)))
 
     def _make_room(self, ids: IntArray) -> None:
         """Forget features other than some, if there are many: a few are found again."""
@@ -90,7 +94,8 @@ class ReferencePatches:
         within = inside(pixels, image.shape, _HALF + 3)
         ids, slots = ids[within], self._taken(int(np.count_nonzero(within)))
         room = self._templates, self._systems, self._warps
-        rich = fill_templates(np.ascontiguousarray(image), pixels[within], slots, *room)
+        pixels = np.ascontiguousarray(pixels[within], np.float32)
+        rich = fill_templates(_for_kernels(image), pixels, slots, *room)
         self._free += slots[~rich].tolist()
         ids, slots = ids[rich], slots[rich]
         ids, slots = np.concatenate([self._ids, ids]), np.concatenate([self._slots, slots])
@@ -108,6 +113,10 @@ class ReferencePatches:
             self._warps = np.concatenate([self._warps, _empty(more, self._warps)])
         taken, self._free = self._free[:count], self._free[count:]
         return np.array(taken, np.int64)
+
+
+def _for_kernels(image: Image) -> Image:
+    return np.require(image, requirements=("C", "W"))
 
 
 def _empty(count: int, like: NDArray[Any]) -> NDArray[Any]:

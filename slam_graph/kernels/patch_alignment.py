@@ -38,7 +38,7 @@ _LEAST_DEVIATION = 1.0
 _FARTHEST_PX = 1.5
 """A window that leaves its first place by more is another one."""
 _LEAST_SCALE = 0.3
-"""A step that shrinks the area of a patch by more than this leads nowhere."""
+"""A step that makes the window larger than the inverse of this leads nowhere."""
 
 
 @compiled()
@@ -172,8 +172,10 @@ def align_patches(
         step_px: a step of the place that is not longer than this is the last one.
 
     Returns:
-        found: (N,) whether the patch stayed in the image and near its first place.
-        correlations: (N,) of template and window before the last step.
+        found: (N,) whether the window has contrast, is like the template at all, and was in the
+            image and near its first place before each step.
+        correlations: (N,) of template and window before the last step; 0 outside the image, -1
+            without contrast.
     """
     height, width = image.shape
     found, correlations = np.zeros(len(points), np.bool_), np.zeros(len(points))

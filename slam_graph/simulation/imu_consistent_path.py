@@ -64,6 +64,9 @@ _ITERATIONS = 15
 _LATE_SIGMA_S, _LATEST_S = 0.02, 0.1
 """Standard deviation of the time offset of a ground truth before it is estimated, and its bound."""
 
+_SHORTEST_S = 2.0
+"""A shorter path does not show it."""
+
 _LATE_COST, _LATE_SLOPE = 1e-4, 0.5
 """The time offset is found when the cost changes by less than this part of it, or by less than
 this per millisecond: a tenth to a fifth of σ."""
@@ -83,8 +86,8 @@ _NOISE_STREAM = 20260101
 def truth_delay_s(truth: Trajectory, imu: ImuData, noise: ImuNoise) -> float:
     """How much later the times of a ground truth are than those of the IMU; 0 below 5 ms.
 
-    The cost of the best path is a function of this delay alone. Its slope is that of the cost of
-    the positions on a path that stays, as the path is a minimum.
+    The cost of the best path is a function of this delay. Its slope is nearly that of the cost of
+    the positions on a path that stays, as the path is a minimum but for the weak orientations.
 
     Args:
         truth: recorded poses of the body (the IMU), at some tens per second or more.
@@ -92,8 +95,11 @@ def truth_delay_s(truth: Trajectory, imu: ImuData, noise: ImuNoise) -> float:
         noise: calibrated densities of the IMU.
 
     Raises:
-        DataError: as `consistent_path` does.
+        DataError: as `consistent_path` does; or if it is 0.1 s or more.
     """
+    first, last = _overlap(truth, imu)
+    if (imu.stamps_ns[last - 1] - imu.stamps_ns[first]) * 1e-9 < _SHORTEST_S:
+        return 0.0
     offset = Rotation.identity()
 
     def cost(late_ms: FloatArray) -> tuple[float, FloatArray]:
@@ -117,6 +123,10 @@ def truth_delay_s(truth: Trajectory, imu: ImuData, noise: ImuNoise) -> float:
         options={"ftol": _LATE_COST, "gtol": _LATE_SLOPE},
     )
     late_s = 1e-3 * float(found.x[0])
+    if abs(late_s) >= 0.99 * _LATEST_S:
+        raise DataError(
+            f"the ground truth is {_LATEST_S} s or more off the IMU's clock; correct its stamps"
+        )
     return late_s if abs(late_s) >= _LATE_NOTED_S else 0.0
 
 

@@ -29,7 +29,7 @@ class PathReport:
     """How a consistent path differs from the ground truth and from the IMU.
 
     Attributes:
-        jumps_ns, jumps_m: (J,) times and sizes of the jumps of the ground truth.
+        jumps_ns, jumps_m: (J,) times, by the clock of the IMU, and sizes of the jumps of the truth.
         bridged_s: total length of the gaps of the ground truth.
         late_s: how much later the times of the ground truth are than those of the IMU, which is
             corrected; 0 if it is little.
