@@ -13,9 +13,9 @@ fault at the latest the run is back, in one of two ways:
   length: both runs are the same before the fault, and a few seconds of path before it would not
   show the yaw well enough. Where the run without a fault is beyond 3 σ itself at that time, that
   tells nothing of the fault: the bar is multiplied by √(its mean NEES / 3), if that is more than 1.
-  It is 1 on tracks. On MH_01 errors of tracks in images are correlated. Its truth is 8 ms late,
-  as its IMU shows without an image; standard deviations are taken at the times of the IMU, and
-  errors in metres as the file of the truth has it.
+  It is 1 on tracks. On MH_01 errors of tracks in images are correlated. The positions of its
+  truth are 8 ms late, as its IMU shows without an image: errors in standard deviations are against
+  these at the times of the IMU, errors in metres against the file of the truth.
 
 What a run says are the warnings that it prints and the run without a fault does not, one of each
 kind, and the message of its end.
@@ -28,7 +28,7 @@ import math
 import re
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
 
@@ -46,7 +46,7 @@ from slam_graph.evaluation.consistency import Nees, nees
 from slam_graph.geometry import Similarity, Trajectory
 from slam_graph.results import RunResult
 from slam_graph.sensors import ImuData
-from slam_graph.simulation.imu_consistent_path import truth_delay_s
+from slam_graph.simulation.imu_consistent_path import at_imu_times, truth_delay_s
 
 RECORDING, TRACKS = "euroc/MH_01_easy_17s", "openvins_sim/euroc_V1_01"
 CLIP_S = 17.0
@@ -112,7 +112,7 @@ class RunPath:
     Attributes:
         estimate: (N) causal poses.
         covariances: (N, 6, 6) of them, body frame, rotation before position.
-        truth: the true trajectory, at the times of the IMU.
+        truth: the true trajectory, with positions at the times of the IMU.
         start_ns: time of the first frame.
     """
 
@@ -240,14 +240,13 @@ def _path_of(result: RunResult, recording: Path) -> RunPath | None:
     truth, start_ns = result.groundtruth, result.input.start_ns
     if truth is None or not len(result.history):
         return None
-    late_ns = round(_late_s(recording) * 1e9)
-    truth = replace(truth, stamps_ns=truth.stamps_ns - late_ns)
+    truth = at_imu_times(truth, _late_s(recording))
     return RunPath(result.trajectory, result.history.pose_covariances(), truth, start_ns)
 
 
 @cache
 def _late_s(recording: Path) -> float:
-    """How much later the times of the truth are than those of the IMU."""
+    """How much later the positions of the truth are than the IMU says."""
     sequence = open_dataset(recording)
     truth, imu = sequence.groundtruth(), ImuData.concatenate(list(sequence.imu_blocks()))
     assert truth is not None

@@ -36,15 +36,22 @@ def flown() -> tuple[Flight, Trajectory, ImuData]:
 
 
 def as_tracked(path: Trajectory) -> Trajectory:
-    """The path as a tracker reports it: late, with noise, a drift and jump, a turned body."""
+    """The path as a tracker reports it: late positions, noise, a drift and jump, a turned body."""
     rng = np.random.default_rng(100)
     seconds = (path.stamps_ns - path.stamps_ns[0]) * 1e-9
     drift = np.clip((seconds - JUMP_AT_S + DRIFT_S) / DRIFT_S, 0.0, None)
     drift[seconds >= JUMP_AT_S] = 0.0
-    positions = path.positions + rng.normal(size=path.positions.shape) * 1e-3
+    positions = late(path, LATE_S).positions + rng.normal(size=path.positions.shape) * 1e-3
     positions[:, 0] += JUMP_M * drift
     turned = Rotation.from_quat(path.quaternions) * Rotation.from_rotvec([OFFSET_RAD, 0.0, 0.0])
-    return Trajectory(path.stamps_ns + round(LATE_S * 1e9), positions, turned.as_quat())
+    return Trajectory(path.stamps_ns, positions, turned.as_quat())
+
+
+def late(path: Trajectory, by_s: float) -> Trajectory:
+    """The path with positions of an earlier time."""
+    then = path.stamps_ns - round(by_s * 1e9)
+    positions = [np.interp(then, path.stamps_ns, column) for column in path.positions.T]
+    return Trajectory(path.stamps_ns, np.stack(positions, axis=1), path.quaternions)
 
 
 def distances(path: Trajectory, found: Trajectory) -> NDArray[np.float64]:
@@ -92,7 +99,7 @@ def test_gaps_of_the_truth_are_bridged_by_the_imu() -> None:
 @pytest.mark.parametrize("late_s", [0.0, 2e-3, -0.03])
 def test_the_clock_of_the_truth_is_found_unless_it_is_little_off(late_s: float) -> None:
     flight, path, imu = flown()
-    truth = replace(path, stamps_ns=path.stamps_ns + round(late_s * 1e9))
+    truth = late(path, late_s)
     expected = late_s if abs(late_s) > 5e-3 else 0.0
     assert truth_delay_s(truth, imu, flight.rig.imu) == pytest.approx(expected, abs=1e-3)
 

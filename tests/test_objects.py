@@ -375,7 +375,7 @@ def test_the_window_of_the_platform_forgets_the_first_pose() -> None:
 
 def test_images_of_a_rendered_object_show_its_motion() -> None:
     sequence = simulate(
-        kind="images", duration_s=4.0, rate_hz=RATE_HZ, objects={"count": 1, "masks": True}
+        kind="images", duration_s=3.0, rate_hz=RATE_HZ, objects={"count": 1, "masks": True}
     )
     result = run(sequence, overrides={"objects.enabled": True, "final_ba.enabled": False})
     found = result.metrics["moving_objects"]["accuracy"]

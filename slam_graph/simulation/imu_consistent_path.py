@@ -7,8 +7,8 @@ tracker has lost its prism and then jumps back, that of motion capture has gaps,
 from the IMU in orientation and in their clock. A camera that is simulated along it would be
 teleported. So the path is the least-squares solution of preintegrated IMU factors (Forster et al.
 2017) and the positions and orientations of the ground truth, in which a Cauchy loss on the
-positions rejects stretches that no motion explains (Barfoot 2017, section 5.3). The clock of the
-ground truth is estimated first, as the time offset under which this problem has its least cost.
+positions rejects stretches that no motion explains (Barfoot 2017, section 5.3). How late its
+positions are is estimated first, as the time offset under which this problem has its least cost.
 
 The solution itself would follow every sample of the IMU, noise included, and an estimator would
 find the IMU better than it is. So white noise of the densities of the calibration is drawn and
@@ -19,8 +19,6 @@ difference between recorded samples and path is white and of the size that the c
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import B, V, X
@@ -29,7 +27,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from slam_graph.arrays import FloatArray
 from slam_graph.errors import DataError
-from slam_graph.geometry import Trajectory
+from slam_graph.geometry import Trajectory, interpolate
 from slam_graph.sensors import (
     ImuData,
     ImuNoise,
@@ -84,7 +82,7 @@ _NOISE_STREAM = 20260101
 
 
 def truth_delay_s(truth: Trajectory, imu: ImuData, noise: ImuNoise) -> float:
-    """How much later the times of a ground truth are than those of the IMU; 0 below 5 ms.
+    """How much later the positions of a ground truth are than the IMU says; 0 below 5 ms.
 
     The cost of the best path is a function of this delay. Its slope is nearly that of the cost of
     the positions on a path that stays, as the path is a minimum but for the weak orientations.
@@ -105,7 +103,7 @@ def truth_delay_s(truth: Trajectory, imu: ImuData, noise: ImuNoise) -> float:
     def cost(late_ms: FloatArray) -> tuple[float, FloatArray]:
         nonlocal offset
         late_s = 1e-3 * float(late_ms[0])
-        moved = _earlier(truth, late_s)
+        moved = at_imu_times(truth, late_s)
         first, last = _overlap(moved, imu)
         batch = _Batch(moved, imu[first:last], imu[first:last], noise)
         states, offset = batch.solve_with_offset(offset, 2)
@@ -130,6 +128,26 @@ def truth_delay_s(truth: Trajectory, imu: ImuData, noise: ImuNoise) -> float:
     return late_s if abs(late_s) >= _LATE_NOTED_S else 0.0
 
 
+def at_imu_times(truth: Trajectory, late_s: float) -> Trajectory:
+    """A ground truth whose positions are late, with them at the right times.
+
+    Its orientations are not late: against the matches of MH_01's images they fit best as they are,
+    while positions do some 7 ms earlier. So they are interpolated at the times of the positions.
+
+    Args:
+        truth: recorded poses.
+        late_s: how much later the times of its positions are than those of the IMU.
+
+    Returns:
+        The poses at the times of their positions, without velocities.
+    """
+    if late_s == 0.0:
+        return truth
+    stamps_ns = truth.stamps_ns - round(late_s * 1e9)
+    turned, valid = interpolate(truth, stamps_ns, max_gap_s=2.0 * _LONGEST_GAP_S)
+    return Trajectory(stamps_ns[valid], truth.positions[valid], turned.quaternions)
+
+
 def consistent_path(
     truth: Trajectory, imu: ImuData, noise: ImuNoise
 ) -> tuple[Trajectory, PathReport]:
@@ -148,16 +166,12 @@ def consistent_path(
         DataError: if they overlap for less than a second, or a gap of the truth is too long.
     """
     late_s = truth_delay_s(truth, imu, noise)
-    truth = _earlier(truth, late_s)
+    truth = at_imu_times(truth, late_s)
     first, last = _overlap(truth, imu)
     batch = _Batch(truth, imu[first:last], _with_noise(imu, noise)[first:last], noise)
     states, offset = batch.solve_with_offset(Rotation.identity(), _OFFSET_ROUNDS)
     path = batch.path(states)
     return path, report_on(truth, path, batch.imu, noise, offset, late_s)
-
-
-def _earlier(truth: Trajectory, by_s: float) -> Trajectory:
-    return replace(truth, stamps_ns=truth.stamps_ns - round(by_s * 1e9))
 
 
 def _overlap(truth: Trajectory, imu: ImuData) -> tuple[int, int]:

@@ -31,7 +31,7 @@ class PathReport:
     Attributes:
         jumps_ns, jumps_m: (J,) times, by the clock of the IMU, and sizes of the jumps of the truth.
         bridged_s: total length of the gaps of the ground truth.
-        late_s: how much later the times of the ground truth are than those of the IMU, which is
+        late_s: how much later the positions of the ground truth are than the IMU says, which is
             corrected; 0 if it is little.
         position_rms_m, position_p95_m, position_max_m: distance from the ground truth where it does
             not jump.
@@ -72,7 +72,7 @@ class PathReport:
         offset = float(np.rad2deg(np.linalg.norm(self.rotation_offset_rad)))
         late = f"{1e3 * abs(self.late_s):.0f} ms {'late' if self.late_s > 0.0 else 'early'}"
         return {
-            "clock of the truth": f"{late}, corrected" if self.late_s else "as the IMU's",
+            "positions of the truth": f"{late}, corrected" if self.late_s else "in time",
             "jumps of the truth": jumps,
             "path to truth": f"{1e3 * self.position_rms_m:.1f} mm rms, 95 % within "
             f"{1e3 * self.position_p95_m:.0f} mm, {1e3 * self.position_max_m:.0f} mm at most; "
@@ -95,12 +95,12 @@ def report_on(
     """How a path differs from the ground truth and the IMU that it was estimated from.
 
     Args:
-        truth: the recorded poses, at the times of the IMU.
+        truth: the recorded poses, with positions at the times of the IMU.
         path: at the times of the samples, with velocities and biases.
         imu: the recorded samples.
         noise: calibrated densities of the IMU.
         offset: constant rotation path_R_truth of the body.
-        late_s: how much later the times of the recorded poses were.
+        late_s: how much later the recorded positions were.
     """
     seconds = (path.stamps_ns - path.stamps_ns[0]) * 1e-9
     at = (truth.stamps_ns - path.stamps_ns[0]) * 1e-9

@@ -39,7 +39,8 @@ from slam_graph.sensors import FeatureFrame, Rig
 _LEAST_FRAMES = 3
 """Frames of a track before it is tested."""
 _ENOUGH, _NEWS, _LEAST_NOISE = 20, 0.1, 0.3
-"""Tracks that tell the noise, weight of one frame of them, and its least ratio to the setting."""
+"""Tracks that tell the noise, weight of one frame of them once there are more than ten (before, all
+weigh alike, the setting as one of them), and its least ratio to the setting."""
 _MOVING_SHARE = 0.3
 """Share of the tracks in a mask that must move before it is an object."""
 _TWO_MOTIONS = 0.25
@@ -85,7 +86,7 @@ class ObjectTracker:
         self._window = TrackWindow(rig, backend)
         self._rig = rig
         self._next = first
-        self._noise = 1.0
+        self._noise, self._noise_frames = 1.0, 0
         self.objects: list[TrackedObject] = []
         self._hidden: list[TrackedObject] = []
 
@@ -228,7 +229,9 @@ class ObjectTracker:
         steady = test.misfits[np.isin(test.verdicts, (Verdict.STATIC, Verdict.UNKNOWN))]
         if len(steady) >= _ENOUGH:
             ratio = float(np.clip(np.median(steady), _LEAST_NOISE**2, 1.0))
-            self._noise += _NEWS * (float(np.sqrt(ratio)) - self._noise)
+            self._noise_frames += 1
+            weight = max(_NEWS, 1.0 / (1.0 + self._noise_frames))
+            self._noise += weight * (float(np.sqrt(ratio)) - self._noise)
         return self._noise
 
     # --- new objects -----------------------------------------------------------------------------
