@@ -4,6 +4,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import gtsam
@@ -303,6 +304,9 @@ def test_bad_frames_are_refused(texture: Spline) -> None:
         frontend.track(CameraFrame(7, (view(texture),)))
     with pytest.raises(DataError, match="camera 'right' has shape"):
         frontend.track(CameraFrame(7, (view(texture), view(texture)[:100])))
+    deep: Any = view(texture).astype(np.uint16)
+    with pytest.raises(DataError, match="values of type uint16; convert it to 8 bits"):
+        frontend.track(CameraFrame(7, (view(texture), deep)))
     with pytest.raises(DataError, match="holds features, not images"):
         frontend.track(FeatureFrame(7, (FeatureObservations.empty(),) * 2))
 

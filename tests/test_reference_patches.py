@@ -118,3 +118,100 @@ def test_patches_are_those_of_the_features_whatever_their_order(count: int) -> N
         placed = patches.placed(tracks, now, corners[ids] + off, np.ones(len(ids), np.bool_))
         errors_px.append(np.linalg.norm(placed - corners[ids], axis=1))
     assert np.median(np.concatenate(errors_px)) < 0.15
+
+
+def placed_from(patches: ReferencePatches, tracks: Tracks, image: Image, start: Pixels) -> Pixels:
+    """Where patches put features of a frame in an image, from where they are believed to be."""
+    return patches.placed(tracks, image, start, np.ones(len(tracks), np.bool_))
+
+
+def corners_and_image() -> tuple[Tracks, Image]:
+    image = images([np.eye(2, 3)])[0]
+    corners = corners_of(image, 40)
+    within = np.all((corners > 30) & (corners < np.array([WIDTH, HEIGHT]) - 30), axis=1)
+    corners = corners[within]
+    return _tracks(image, np.arange(len(corners)), corners), image
+
+
+def test_a_patch_that_is_half_hidden_neither_moves_its_feature_nor_its_warp() -> None:
+    tracks, image = corners_and_image()
+    hidden = (0.45 * image + 0.55 * image[::-1, ::-1]).astype(np.uint8)  # another place shines in
+    patches = ReferencePatches()
+    placed_from(patches, tracks, image, tracks.pixels)
+    start = tracks.pixels + np.float32(0.5)
+    for _ in range(2):
+        found = placed_from(patches, tracks, hidden, start)
+    assert np.mean(np.any(found != start, axis=1)) < 0.2
+    again = placed_from(patches, tracks, image, start)
+    assert np.median(np.linalg.norm(again - tracks.pixels, axis=1)) < 0.03
+
+
+def scaled(image: Image, tracks: Tracks, factors: tuple[float, float]) -> tuple[Image, Pixels]:
+    """An image that is stretched about its middle, and where features are in it."""
+    middle = np.array([WIDTH / 2, HEIGHT / 2])
+    A = np.diag(factors)
+    view = np.column_stack([A, middle - A @ middle])
+    grey = cv2.warpAffine(image, view, (WIDTH, HEIGHT), flags=cv2.INTER_CUBIC)
+    return grey, ((tracks.pixels - middle) @ A.T + middle).astype(np.float32)
+
+
+@pytest.mark.parametrize(
+    ("factors", "given_up"),
+    [((1.4, 1.4), False), ((1.7, 1.7), True), ((1.25, 0.8), False), ((1.5, 1 / 1.5), True)],
+)
+def test_a_patch_is_given_up_where_its_area_or_its_shape_changes_too_much(
+    factors: tuple[float, float], given_up: bool
+) -> None:
+    """Step by step a patch follows the change, which one step could not bring about."""
+    tracks, image = corners_and_image()
+    patches, steps, off = ReferencePatches(), 16, np.float32(0.4)
+    for k in range(1, steps + 1):
+        share = tuple(factor ** (k / steps) for factor in factors)
+        now, true = scaled(image, tracks, (share[0], share[1]))
+        found = placed_from(patches, tracks, now, true)
+    # from off its place a feature is moved back by its first patch, and to no other
+    again = placed_from(patches, tracks, now, true + off)
+    inner = np.all((true > 20) & (true < np.array([WIDTH, HEIGHT]) - 20), axis=1)
+    errors_px = np.linalg.norm(again - true, axis=1)[inner]
+    assert (np.median(errors_px) > 0.2) == given_up
+    assert len(found) == len(tracks)
+
+
+def test_one_image_without_the_patch_does_not_replace_it_and_three_do() -> None:
+    tracks, image = corners_and_image()
+    blank = np.full_like(image, 128)
+    for images_without, kept in ((1, True), (3, False)):
+        patches = ReferencePatches()
+        placed_from(patches, tracks, image, tracks.pixels)
+        for _ in range(images_without):
+            placed_from(patches, tracks, blank, tracks.pixels)
+        # a feature that is 1 px off when a new patch is taken stays there
+        slid = _tracks(image, tracks.ids, tracks.pixels + np.float32(0.7))
+        found = placed_from(patches, slid, image, slid.pixels)
+        errors_px = np.linalg.norm(found - tracks.pixels, axis=1)
+        assert (np.median(errors_px) < 0.1) == kept
+
+
+def test_patches_outlast_an_image_with_few_features_and_those_forgotten_do_not() -> None:
+    tracks, image = corners_and_image()
+    patches = ReferencePatches()
+    placed_from(patches, tracks, image, tracks.pixels)
+    few = tracks.select(np.arange(len(tracks)) < 2)
+    placed_from(patches, few, image, few.pixels)
+    patches.forget(tracks.ids[::2])
+    slid = _tracks(image, tracks.ids, tracks.pixels + np.float32(0.7))
+    errors_px = np.linalg.norm(
+        placed_from(patches, slid, image, slid.pixels) - tracks.pixels, axis=1
+    )
+    assert np.median(errors_px[1::2]) < 0.1
+    assert np.median(errors_px[::2]) > 0.5
+
+
+def test_patches_of_features_that_do_not_come_back_are_dropped() -> None:
+    """Without being told: memory of a long run stays what it was."""
+    tracks, image = corners_and_image()
+    patches = ReferencePatches()
+    for k in range(130):
+        ids = tracks.ids + k * len(tracks)
+        placed_from(patches, _tracks(image, ids, tracks.pixels), image, tracks.pixels)
+    assert patches.count <= 101 * len(tracks)

@@ -241,6 +241,11 @@ class ImageFrontend:
             )
         for rig_camera, image in zip(cameras, frame.images, strict=True):
             size = (rig_camera.camera.height, rig_camera.camera.width)
+            if image is not None and image.dtype != np.uint8:
+                raise DataError(
+                    f"frame {frame.stamp_ns}: the image of camera '{rig_camera.name}' has values "
+                    f"of type {image.dtype}; convert it to 8 bits (uint8)"
+                )
             if image is not None and image.shape != size:
                 raise DataError(
                     f"frame {frame.stamp_ns}: the image of camera '{rig_camera.name}' has shape "

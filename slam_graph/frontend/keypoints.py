@@ -218,3 +218,8 @@ def spread(pixels: Pixels, count: int, distance_px: float) -> IntArray:
         taken |= np.sum((pixels - pixels[best]) ** 2, axis=1) < distance_px**2
         taken[best] = True
     return np.array(chosen, np.int64)
+
+
+def contiguous(image: Image) -> Image:
+    """The image as kernels take it, contiguous and writable: itself if it is, otherwise a copy."""
+    return np.require(image, requirements=("C", "W"))

@@ -6,8 +6,9 @@ Lucas-Kanade from image to image adds the error of each image to those before: a
 a track is several tenths of a pixel beside its corner. So each feature keeps the patch around it of
 its first image. What Lucas-Kanade found is refined until the new image shows that patch, under an
 affine warp that follows the change of view (as SVO does: Forster, Pizzoli & Scaramuzza 2014,
-section IV.B; the warp is estimated here, where SVO takes it from the map). Where that fails, or the
-view has changed too much, the feature stays where it was tracked to, with a new patch from there.
+section IV.B; the warp is estimated here, where SVO takes it from the map). Where that fails the
+feature stays where it was tracked to; where it fails in several images, or the view has changed too
+much, it gets a new patch from there.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from numpy.typing import NDArray
 
 from slam_graph.arrays import BoolArray, FloatArray, IntArray
 from slam_graph.frontend.association import inside
-from slam_graph.frontend.keypoints import Image, Pixels, Tracks
+from slam_graph.frontend.keypoints import Image, Pixels, Tracks, contiguous
 from slam_graph.kernels.ascending import are_among
 from slam_graph.kernels.patch_alignment import PATCH_PX, ROW_PX, align_patches
 from slam_graph.kernels.patch_templates import fill_templates
@@ -30,8 +31,14 @@ _LEAST_CORRELATION = 0.8
 """What is less alike is not taken for the same patch."""
 _SMALLEST, _LARGEST = 0.4, 2.5
 """Change of the area of a patch beyond which a new one shows more."""
-_MOST_MISSING = 3
-"""Patches that are kept for each feature that is tracked: of those that are lost, too."""
+_MOST_STRETCHED = 2.0
+"""The same for the ratio of the singular values of its warp, as on a wall that is seen from the
+side."""
+_MOST_REFUSALS = 3
+"""After so many images in a row that do not show it a patch is given up: one image may be blurred,
+and a patch from that would be worse."""
+_KEPT_IMAGES = 100
+"""A patch is kept for so many images in which its feature is not tracked: some are found again."""
 
 _HALF = PATCH_PX // 2
 
@@ -40,50 +47,58 @@ class ReferencePatches:
     """The patches of the features of one camera."""
 
     def __init__(self) -> None:
+        self._image = 0  # number of the last one
         self._ids: IntArray = np.zeros(0, np.int64)  # ascending
         self._slots: IntArray = np.zeros(0, np.int64)  # where each of them is in what follows
         self._free: list[int] = []
         self._templates = np.zeros((0, 3, PATCH_PX * ROW_PX), np.float32)
         self._systems: FloatArray = np.zeros((0, 8, 6))
         self._warps: FloatArray = np.zeros((0, 2, 2))
+        self._refusals: IntArray = np.zeros(0, np.int64)  # in a row
+        self._last_tracked: IntArray = np.zeros(0, np.int64)  # number of the image
+
+    @property
+    def count(self) -> int:
+        """How many patches are kept."""
+        return len(self._ids)
 
     def placed(self, before: Tracks, image: Image, points: Pixels, good: BoolArray) -> Pixels:
         """Pixels (N, 2) of features in a new image, by their patches.
 
         Args:
-            before: the image before and its features.
+            before: the image before and its features, with ascending ids.
             image: the new one.
-            points: (N, 2) where these were tracked to.
-            good: (N,) which were; others stay where they are.
+            points: (N, 2) where these were tracked to, in pixels.
+            good: (N,) which of them were tracked; others stay where they are.
         """
         assert before.image is not None
-        self._make_room(before.ids)
+        self._image += 1
+        self._remove(self._last_tracked[self._slots] < self._image - _KEPT_IMAGES)
         new = np.flatnonzero(~are_among(before.ids, self._ids))
         self._add(before.image, before.ids[new], before.pixels[new])
         rows = np.flatnonzero(good & are_among(before.ids, self._ids))
         slots = self._slots[np.searchsorted(self._ids, before.ids[rows])]
-        places = points[rows].astype(np.float64)
+        places, warps = points[rows].astype(np.float64), self._warps[slots]
         found, correlations = align_patches(
-            _for_kernels(image),
+            contiguous(image),
             *(self._templates, self._systems, self._warps, slots),
             *(places, _ITERATIONS, _STEP_PX),
         )
-        (a, b), (c, d) = self._warps[slots].transpose(1, 2, 0)
-        areas = a * d - b * c
-        found &= (correlations > _LEAST_CORRELATION) & (areas > _SMALLEST) & (areas < _LARGEST)
+        found &= correlations > _LEAST_CORRELATION
+        self._warps[slots[~found]] = warps[~found]
+        changed = _view_has_changed(self._warps[slots])
+        found &= ~changed
         points = points.copy()
         points[rows[found]] = places[found]
-        self._remove(are_among(self._ids, before.ids[rows[~found]]))  # new ones in the next image
+        self._last_tracked[slots] = self._image
+        self._refusals[slots] = np.where(found, 0, self._refusals[slots] + 1)
+        given_up = changed | (self._refusals[slots] >= _MOST_REFUSALS)
+        self._remove(are_among(self._ids, before.ids[rows[given_up]]))  # new ones in the next image
         return points
 
     def forget(self, ids: IntArray) -> None:
-        """Drop the patches of features that do not come back."""
-        self._remove(are_among(self._ids, np.sort(ids)))
-
-    def _make_room(self, ids: IntArray) -> None:
-        """Forget features other than some, if there are many: a few are found again."""
-        if len(self._ids) > _MOST_MISSING * len(ids) + _MOST_MISSING:
-            self._remove(~are_among(self._ids, ids))
+        """Drop the patches of features (N,) that do not come back."""
+        self._remove(are_among(self._ids, np.sort(np.asarray(ids, np.int64))))
 
     def _remove(self, which: BoolArray) -> None:
         self._free += self._slots[which].tolist()
@@ -95,9 +110,10 @@ class ReferencePatches:
         ids, slots = ids[within], self._taken(int(np.count_nonzero(within)))
         room = self._templates, self._systems, self._warps
         pixels = np.ascontiguousarray(pixels[within], np.float32)
-        rich = fill_templates(_for_kernels(image), pixels, slots, *room)
-        self._free += slots[~rich].tolist()
-        ids, slots = ids[rich], slots[rich]
+        textured = fill_templates(contiguous(image), pixels, slots, *room)
+        self._free += slots[~textured].tolist()
+        ids, slots = ids[textured], slots[textured]
+        self._refusals[slots], self._last_tracked[slots] = 0, self._image
         ids, slots = np.concatenate([self._ids, ids]), np.concatenate([self._slots, slots])
         order = np.argsort(ids, kind="stable")
         self._ids, self._slots = ids[order], slots[order]
@@ -108,16 +124,23 @@ class ReferencePatches:
         if len(self._free) < count:
             more = max(count, had)
             self._free += range(had, had + more)
-            self._templates = np.concatenate([self._templates, _empty(more, self._templates)])
-            self._systems = np.concatenate([self._systems, _empty(more, self._systems)])
-            self._warps = np.concatenate([self._warps, _empty(more, self._warps)])
+            self._templates = _longer(self._templates, more)
+            self._systems, self._warps = _longer(self._systems, more), _longer(self._warps, more)
+            self._refusals = _longer(self._refusals, more)
+            self._last_tracked = _longer(self._last_tracked, more)
         taken, self._free = self._free[:count], self._free[count:]
         return np.array(taken, np.int64)
 
 
-def _for_kernels(image: Image) -> Image:
-    return np.require(image, requirements=("C", "W"))
+def _view_has_changed(warps: FloatArray) -> BoolArray:
+    """Whether warps (N, 2, 2) change the area or the shape of a patch too much."""
+    (a, b), (c, d) = warps.transpose(1, 2, 0)
+    areas = a * d - b * c  # the product of the singular values, of whose squares this is the sum:
+    squares = a * a + b * b + c * c + d * d
+    stretched = squares > (_MOST_STRETCHED + 1.0 / _MOST_STRETCHED) * areas
+    return np.asarray((areas < _SMALLEST) | (areas > _LARGEST) | stretched)
 
 
-def _empty(count: int, like: NDArray[Any]) -> NDArray[Any]:
-    return np.zeros((count, *like.shape[1:]), like.dtype)
+def _longer(rows: NDArray[Any], count: int) -> NDArray[Any]:
+    """Rows with so many zeros behind them."""
+    return np.concatenate([rows, np.zeros((count, *rows.shape[1:]), rows.dtype)])
