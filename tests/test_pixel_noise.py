@@ -133,8 +133,10 @@ def test_each_camera_has_its_noise_within_bounds(tracks: Tracks) -> None:
     np.testing.assert_allclose(learned(tracks, (0.5, 2.0), on), [0.5, 2.0], rtol=0.08)
     np.testing.assert_allclose(learned(tracks, (0.05, 0.05), on), [0.25, 0.25])
     np.testing.assert_allclose(learned(tracks, (20.0, 20.0), on), [4.0, 4.0])
-    np.testing.assert_allclose(learned(tracks, (0.5, 2.0), NoiseConfig()), [1.0, 2.0], rtol=0.08)
-    np.testing.assert_array_equal(learned(tracks, (1.1, 0.9), NoiseConfig()), [1.0, 1.0])
+    for choice, smaller in (("clear", 0.5), ("larger", 1.0)):
+        config = NoiseConfig.model_validate({"adaptive_pixels": choice})
+        np.testing.assert_allclose(learned(tracks, (0.5, 2.0), config), [smaller, 2.0], rtol=0.08)
+        np.testing.assert_array_equal(learned(tracks, (1.1, 0.9), config), [1.0, 1.0])
     never = NoiseConfig(adaptive_pixels="never")
     np.testing.assert_array_equal(learned(tracks, (0.5, 2.0), never), [1.0, 1.0])
 

@@ -47,11 +47,11 @@ class NoiseConfig(Settings):
     a data sheet, or if images contradict the state and runs diverge: the IMU then counts less."""
     adaptive: AdaptiveNoiseConfig = AdaptiveNoiseConfig()
     """White noise of the IMU that is estimated from how the images correct its predictions."""
-    adaptive_pixels: Literal["never", "larger", "any"] = expert("larger")
-    """Estimate the noise of the observations of each camera from the residuals of tracks. larger:
-    take it where it is clearly larger than `pixel_sigma`, up to four times that. any: also where
-    it is smaller, down to a quarter; covariances are then more often too small. never: take
-    `pixel_sigma`, as GTSAM's smoothers always do."""
+    adaptive_pixels: Literal["never", "larger", "clear", "any"] = expert("clear")
+    """Estimate the noise of the observations of each camera from the residuals of tracks. clear:
+    take it where it is clearly larger or smaller than `pixel_sigma`, by a quarter at least and by
+    four times at most. larger: only where it is larger. any: also where it is not clear. never:
+    take `pixel_sigma`, as GTSAM's smoothers always do."""
     drift_px: float = expert(0.0, ge=0)
     """How far tracks drift off their points in one frame, in pixels along each axis: √n times as
     far in n frames. It is process noise of the features in the state."""

@@ -51,8 +51,8 @@ _MAX_RATIO = 4.0
 """Largest ratio of the estimate to the setting, and of the setting to the estimate."""
 _DRIFT_STEPS = 2
 """One step of so many asks how far tracks slide off their points: it takes time."""
-_CLEARLY_LARGER = 1.25
-"""Ratio of the estimate to the setting from which `larger` takes the estimate."""
+_CLEARLY = 1.25
+"""Ratio of the estimate to the setting, or of the setting to the estimate, that is no chance."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -149,11 +149,11 @@ class PixelNoise:
         sigma_px = np.sqrt(self._squares / self._dof)
         self.estimate_px = np.clip(sigma_px, setting / _MAX_RATIO, setting * _MAX_RATIO)
         self._squares = self._dof * self.estimate_px**2  # what is beyond does not pile up
-        if self._config.adaptive_pixels == "any":
-            self.sigma_px = self.estimate_px
-        else:
-            larger = self.estimate_px > _CLEARLY_LARGER * setting
-            self.sigma_px = np.where(larger, self.estimate_px, setting)
+        taken = self.estimate_px > _CLEARLY * setting
+        if self._config.adaptive_pixels in {"clear", "any"}:
+            taken |= self.estimate_px < setting / _CLEARLY
+        taken |= self._config.adaptive_pixels == "any"
+        self.sigma_px = np.where(taken, self.estimate_px, setting)
 
 
 def _extents_px(obs: Observations, cameras: int) -> FloatArray:
