@@ -135,7 +135,8 @@ class PixelNoise:
 
     def _learn_noise(self, obs: Observations, residuals: FloatArray, by_point: FloatArray) -> None:
         """Learn how noisy each camera is from residuals (N, 2) and their derivatives, in pixels."""
-        sigma = self.sigma_px[obs.camera]
+        unit = self.estimate_px  # where the cut is right, whatever the cost takes
+        sigma = unit[obs.camera]
         parts = residuals / sigma[:, None], by_point / sigma[:, None, None]
         try:
             found = block_means(obs, *parts, len(self.sigma_px))
@@ -144,7 +145,7 @@ class PixelNoise:
         for camera, means in enumerate(found):
             self._dof[camera] += np.sum(means.dof)
             share = float(means.dof @ winsorised(means.squares, means.dof, _QUANTILE))
-            self._squares[camera] += share * self.sigma_px[camera] ** 2
+            self._squares[camera] += share * unit[camera] ** 2
         setting = self._config.pixel_sigma
         sigma_px = np.sqrt(self._squares / self._dof)
         self.estimate_px = np.clip(sigma_px, setting / _MAX_RATIO, setting * _MAX_RATIO)
