@@ -8,14 +8,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy.optimize import OptimizeResult
 from scipy.spatial.transform import Rotation
 
 from slam_graph.datasets import read_groundtruth
 from slam_graph.errors import DataError
 from slam_graph.geometry import Trajectory
 from slam_graph.sensors import ImuData
-from slam_graph.simulation import simulate
-from slam_graph.simulation.imu_consistent_path import consistent_path, truth_delay_s
+from slam_graph.simulation import imu_consistent_path, simulate
+from slam_graph.simulation.imu_consistent_path import at_imu_times, consistent_path, truth_delay_s
 from slam_graph.simulation.path_report import PathReport
 from slam_graph.simulation.simulated_sequence import Flight
 
@@ -52,6 +53,13 @@ def late(path: Trajectory, by_s: float) -> Trajectory:
     then = path.stamps_ns - round(by_s * 1e9)
     positions = [np.interp(then, path.stamps_ns, column) for column in path.positions.T]
     return Trajectory(path.stamps_ns, np.stack(positions, axis=1), path.quaternions)
+
+
+def part(path: Trajectory, from_s: float, to_s: float) -> Trajectory:
+    """The poses of the path between two times, from its beginning on."""
+    seconds = (path.stamps_ns - path.stamps_ns[0]) * 1e-9
+    rows = (seconds >= from_s) & (seconds <= to_s)
+    return Trajectory(path.stamps_ns[rows], path.positions[rows], path.quaternions[rows])
 
 
 def distances(path: Trajectory, found: Trajectory) -> NDArray[np.float64]:
@@ -102,6 +110,70 @@ def test_the_clock_of_the_truth_is_found_unless_it_is_little_off(late_s: float) 
     truth = late(path, late_s)
     expected = late_s if abs(late_s) > 5e-3 else 0.0
     assert truth_delay_s(truth, imu, flight.rig.imu) == pytest.approx(expected, abs=1e-3)
+
+
+@pytest.mark.parametrize("late_s", [0.12, -0.12])
+def test_a_truth_far_off_the_clock_of_the_imu_is_refused(late_s: float) -> None:
+    flight, path, imu = flown()
+    truth = part(late(path, late_s), 8.0, 18.0)
+    with pytest.raises(DataError, match=r"0\.1 s or more off the IMU's clock"):
+        consistent_path(truth, imu, flight.rig.imu)
+
+
+def test_two_seconds_are_too_short_to_tell_how_late_a_truth_is() -> None:
+    flight, path, imu = flown()
+    truth = part(late(path, 0.03), 8.0, 9.9)
+    assert truth_delay_s(truth, imu, flight.rig.imu) == 0.0
+
+
+def test_positions_are_taken_earlier_and_orientations_are_not() -> None:
+    flight, path, _ = flown()
+    moved = at_imu_times(late(path, LATE_S), LATE_S)
+    moved = part(moved, 1.0, 20.0)  # `late` repeats the first position
+    exact = flight.motion.rotations(moved.stamps_ns)
+    turned = (exact.inv() * Rotation.from_quat(moved.quaternions)).magnitude()
+    assert np.max(turned) < 1e-6
+    assert np.max(np.abs(moved.positions - flight.motion.positions(moved.stamps_ns))) < 1e-9
+
+
+@pytest.mark.parametrize(
+    ("late_s", "words"),
+    [(0.024, "24 ms late, corrected"), (-0.024, "24 ms early, corrected"), (0.0, "in time")],
+)
+def test_a_report_says_whether_positions_were_late_or_early(late_s: float, words: str) -> None:
+    none = np.zeros(0)
+    report = PathReport(
+        jumps_ns=none.astype(np.int64),
+        jumps_m=none,
+        bridged_s=0.0,
+        late_s=late_s,
+        position_rms_m=3e-3,
+        position_p95_m=5e-3,
+        position_max_m=9e-3,
+        rotation_offset_rad=np.zeros(3),
+        rotation_rms_rad=0.0,
+        gyro_ratio=1.0,
+        accel_ratio=1.0,
+        gyro_correlation=0.0,
+        accel_correlation=0.0,
+    )
+    assert report.lines()["positions of the truth"] == words
+
+
+def test_a_search_that_does_not_converge_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    flight, path, imu = flown()
+    ended = OptimizeResult(x=np.array([12.0]), success=False, message="ABNORMAL")
+    monkeypatch.setattr(imu_consistent_path, "minimize", lambda *_, **__: ended)
+    with pytest.raises(DataError, match=r"ended at 12\.0 ms without convergence \(ABNORMAL\)"):
+        truth_delay_s(path, imu, flight.rig.imu)
+
+
+def test_a_truth_that_no_motion_explains_is_an_error() -> None:
+    flight, path, imu = flown()
+    short = part(path, 8.0, 12.0)
+    stretched = replace(short, positions=30.0 * short.positions)
+    with pytest.raises(DataError, match="no path fits ground truth and IMU"):
+        consistent_path(stretched, imu, flight.rig.imu)
 
 
 def test_what_cannot_be_joined_is_an_error() -> None:

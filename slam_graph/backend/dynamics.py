@@ -41,8 +41,11 @@ _STATE_FEATURE_FRAMES = 2
 the pose from frame to frame."""
 
 _MORE_FEATURES, _MORE_WITH_DEPTH = 1.25, 2.5
-"""How many times as many features are held in the state as with an IMU. By two cameras far points
-are known less exactly than a filter can linearise: with 2.5 times the NEES of stereo doubles."""
+"""How many times as many features are held in the state as with an IMU. Two cameras know far
+points less exactly than a filter can linearise, so more features make it too sure: on simulated
+flights of `msckf` the NEES of position and orientation is 4.6 and 4.1 with 60 features (1.5 times)
+and 3.7 and 3.5 with 50, where 4.16 is the bar. With 100 the NEES of position is twice as large as
+with 40."""
 
 
 @dataclass(frozen=True, eq=False)

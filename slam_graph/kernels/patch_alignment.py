@@ -21,7 +21,8 @@ from slam_graph.kernels.compilation import compiled
 __all__ = ["PATCH_PX", "ROW_PX", "align_patches", "align_patches_numpy"]
 
 PATCH_PX, ROW_PX = 15, 16
-"""Side of a patch, and what a row of it takes with one zero at its end: a multiple of vectors."""
+"""Side of a patch, and the length of its rows in memory: with one zero at the end it is a multiple
+of the vectors of the processor."""
 
 _Image = NDArray[np.uint8]
 _Templates = NDArray[np.float32]
@@ -37,8 +38,8 @@ _LEAST_DEVIATION = 1.0
 """A window with less contrast (grey levels) has nothing to align."""
 _FARTHEST_PX = 1.5
 """A window that leaves its first place by more is another one."""
-_LEAST_SCALE = 0.3
-"""A step that makes the window larger than the inverse of this leads nowhere."""
+_LEAST_AREA = 0.3
+"""A step that makes the area of the window more than 1 / 0.3 times as large leads nowhere."""
 
 
 @compiled()
@@ -51,26 +52,27 @@ def _sum_window(
     values: _Values,
     sums: _Sums,
 ) -> None:
-    """Sums over a window of an image, ROW_PX each, column by column.
-
-    They are of the window, its square, its products with the template and with the derivatives of
-    that along columns and rows, and the last two times the row of the patch.
+    """Sums over the rows of a window of an image, for each of its columns.
 
     Args:
-        image: (height, width).
-        place: its middle.
-        warp: by rows.
+        image: (height, width) grey.
+        place: of the middle of the window, along columns and rows, in pixels of the image.
+        warp: image_A_template, by rows. The window is inside the image.
         template: (3, 240), see `align_patches`.
-        cells: room.
-        values: room.
-        sums: what is found.
+        cells: room, six arrays (ROW_PX,).
+        values: room, three arrays (ROW_PX,).
+        sums: seven arrays (ROW_PX,), which are overwritten. With the grey values W of the window,
+            the template T and its derivatives T_x and T_y along columns and rows, and the row r
+            of the patch, from -1 to 1, they are the sums of W, W², W T, W T_x, W T_y, W T_x r and
+            W T_y r.
     """
     (u, v, g00, g01, g10, g11), (grey, right, below) = cells, values
     (x, y), (a, b, c, d) = place, warp
     T, dx, dy = template[0], template[1], template[2]
-    total, squares, same, along_x, along_y, row_x, row_y = sums
+    total, squares, by_template, along_x, along_y, row_x, row_y = sums
     for k in range(ROW_PX):
-        total[k] = squares[k] = same[k] = along_x[k] = along_y[k] = row_x[k] = row_y[k] = 0.0
+        total[k] = squares[k] = by_template[k] = 0.0
+        along_x[k] = along_y[k] = row_x[k] = row_y[k] = 0.0
     for row in range(PATCH_PX):
         begin_x, begin_y = x - a * _HALF + b * (row - _HALF), y - c * _HALF + d * (row - _HALF)
         for k in range(ROW_PX):
@@ -93,7 +95,7 @@ def _sum_window(
             by_x, by_y = value * dx[m], value * dy[m]
             total[k] += value
             squares[k] += value * value
-            same[k] += value * T[m]
+            by_template[k] += value * T[m]
             along_x[k] += by_x
             along_y[k] += by_y
             row_x[k] += down * by_x
@@ -102,25 +104,26 @@ def _sum_window(
 
 @compiled()
 def _step(system: FloatArray, sums: _Sums, products: FloatArray, step: FloatArray) -> float:
-    """The step (6,) of place and warp by the sums of a window, and how alike the two are.
+    """The Gauss-Newton step of place and warp, and the correlation of window and template.
 
     Args:
         system: (8, 6), see `align_patches`.
-        sums: of the window.
+        sums: of the window, see `_sum_window`.
         products: (6,) room.
-        step: (6,) what is found.
+        step: (6,) which is overwritten: of the place in pixels of the template, and of the four
+            entries of the warp times half a patch. It moves the template and not the window.
 
     Returns:
         The correlation; -1 where the window has no contrast.
     """
-    totals, squares, sames, along_x, along_y, row_x, row_y = sums
+    totals, squares, by_template, along_x, along_y, row_x, row_y = sums
     products[:] = 0.0
-    total = square = same = 0.0
+    total = square = template_sum = 0.0
     for k in range(PATCH_PX):
         across = (k - _HALF) / _HALF
         total += totals[k]
         square += squares[k]
-        same += sames[k]
+        template_sum += by_template[k]
         products[0] += along_x[k]
         products[1] += along_y[k]
         products[2] += across * along_x[k]
@@ -132,12 +135,12 @@ def _step(system: FloatArray, sums: _Sums, products: FloatArray, step: FloatArra
         return -1.0
     gain = 1.0 / math.sqrt(variance)
     for m in range(6):
-        products[m] -= system[6, m] * total + system[7, m] * same
+        products[m] -= system[6, m] * total + system[7, m] * template_sum
     for m in range(6):
         step[m] = 0.0
         for k in range(6):
             step[m] += gain * system[m, k] * products[k]
-    return gain * same / _COUNT
+    return gain * template_sum / _COUNT
 
 
 @compiled(
@@ -169,13 +172,16 @@ def align_patches(
         rows: (N,) which of the templates are looked for, each once.
         points: (N, 2) where the middles of these are, in pixels; moved for those that are found.
         iterations: most steps.
-        step_px: a step of the place that is not longer than this is the last one.
+        step_px: a step of the place that is not longer than this is the last one, in pixels of
+            the template (a step in the image is the warp times it).
 
     Returns:
-        found: (N,) whether the window has contrast, is like the template at all, and was in the
-            image and near its first place before each step.
-        correlations: (N,) of template and window before the last step; 0 outside the image, -1
-            without contrast.
+        found: (N,) whether before each step the window was in the image, had contrast, and had a
+            positive correlation with the template, and whether no step took it further than 1.5
+            pixels of the image from its first place. The window after the last step is not looked
+            at: it may reach out of the image, and its correlation is not known.
+        correlations: (N,) of template and window before the last step; -1 without contrast, 0 if
+            the first window reaches out of the image.
     """
     height, width = image.shape
     found, correlations = np.zeros(len(points), np.bool_), np.zeros(len(points))
@@ -207,15 +213,15 @@ def align_patches(
             # the inverse of the step: B⁻¹, and -B⁻¹ t
             b00, b01 = 1.0 + step[2] / _HALF, step[3] / _HALF
             b10, b11 = step[4] / _HALF, 1.0 + step[5] / _HALF
-            scale = b00 * b11 - b01 * b10
-            inside = scale > _LEAST_SCALE
+            area = b00 * b11 - b01 * b10
+            inside = area > _LEAST_AREA
             if not inside:
                 break
-            back_x = (b01 * step[1] - b11 * step[0]) / scale
-            back_y = (b10 * step[0] - b00 * step[1]) / scale
+            back_x = (b01 * step[1] - b11 * step[0]) / area
+            back_y = (b10 * step[0] - b00 * step[1]) / area
             x, y = x + a * back_x + b * back_y, y + c * back_x + d * back_y
-            a, b = (a * b11 - b * b10) / scale, (b * b00 - a * b01) / scale
-            c, d = (c * b11 - d * b10) / scale, (d * b00 - c * b01) / scale
+            a, b = (a * b11 - b * b10) / area, (b * b00 - a * b01) / area
+            c, d = (c * b11 - d * b10) / area, (d * b00 - c * b01) / area
             away_x, away_y = x - points[i, 0], y - points[i, 1]
             inside = away_x * away_x + away_y * away_y < _FARTHEST_PX * _FARTHEST_PX
             if not inside or back_x * back_x + back_y * back_y <= step_px * step_px:
@@ -268,7 +274,7 @@ def align_patches_numpy(
             products = J @ window - systems[n, 6] * window.sum() - systems[n, 7] * (window @ T)
             step = gain * systems[n, :6] @ products
             change = np.eye(2) + step[2:].reshape(2, 2) / _HALF
-            if np.linalg.det(change) <= _LEAST_SCALE:
+            if np.linalg.det(change) <= _LEAST_AREA:
                 break
             back = -np.linalg.solve(change, step[:2])
             place, warp = place + warp @ back, warp @ np.linalg.inv(change)

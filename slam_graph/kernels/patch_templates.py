@@ -17,12 +17,13 @@ __all__ = ["fill_templates", "fill_templates_numpy"]
 _PX, _ROW = 15, 16  # PATCH_PX and ROW_PX of `patch_alignment.py`: a kernel sees its own file only
 _HALF, _COUNT = _PX // 2, _PX * _PX
 _WARP_NOISE_GREY = 2.0
-"""Noise of the image against which a warp by a pixel at the edge of a patch is held: where a patch
-does not show its warp, that stays."""
+"""Standard deviation of noise of the image (grey levels) that weighs against a change of the warp
+by a pixel at the edge of a patch: where a patch does not show its warp, that stays."""
 _LEAST_DEVIATION = 1.0
 """A patch with less contrast (grey levels) is none."""
 _LEAST_INFORMATION = 1e-9
-"""Where a patch has gradients along one direction only, the other stays as it is."""
+"""Added to the sums of J Jᵀ, so that they have an inverse: where a patch has gradients along one
+direction only, it is not moved along the other."""
 
 
 @compiled()
@@ -59,18 +60,18 @@ def fill_templates(
 
     Args:
         image: (height, width) grey.
-        pixels: (N, 2), 10 pixels or more from the edge.
-        slots: (N,) which of the templates to fill.
+        pixels: (N, 2) the middles of the patches, 10 pixels or more from the edge.
+        slots: (N,) which of the templates to fill, each once.
         templates: (T, 3, 240).
         systems: (T, 8, 6).
-        warps: (T, 2, 2), made the identity.
+        warps: (T, 2, 2), those of the filled templates are made the identity.
 
     Returns:
         (N,) whether a patch has contrast; of others nothing is filled.
     """
-    rich = np.zeros(len(pixels), np.bool_)
+    textured = np.zeros(len(pixels), np.bool_)
     grey, J = np.empty((_PX + 2, _PX + 2)), np.empty(6)
-    H, means, alike = np.empty((6, 6)), np.empty(6), np.empty(6)
+    H, means, correlations = np.empty((6, 6)), np.empty(6), np.empty(6)
     for i in range(len(pixels)):
         n, x, y = slots[i], float(pixels[i, 0]), float(pixels[i, 1])
         right, below = x % 1.0, y % 1.0
@@ -92,8 +93,8 @@ def fill_templates(
         deviation = math.sqrt(squares / _COUNT)
         if deviation < _LEAST_DEVIATION:
             continue
-        rich[i] = True
-        H[:], means[:], alike[:] = 0.0, 0.0, 0.0
+        textured[i] = True
+        H[:], means[:], correlations[:] = 0.0, 0.0, 0.0
         for row in range(_PX):
             down = (row - _HALF) / _HALF
             for column in range(_PX):
@@ -106,24 +107,24 @@ def fill_templates(
                 J[4], J[5] = dy * across, dy * down
                 for m in range(6):
                     means[m] += J[m]
-                    alike[m] += J[m] * T
+                    correlations[m] += J[m] * T
                     for j in range(m + 1):
                         H[m, j] += J[m] * J[j]
         noise = _WARP_NOISE_GREY / deviation
         for m in range(6):
             means[m] /= _COUNT
-            alike[m] /= _COUNT
+            correlations[m] /= _COUNT
         for m in range(6):
             for j in range(m + 1):
-                H[m, j] -= _COUNT * (means[m] * means[j] + alike[m] * alike[j])
+                H[m, j] -= _COUNT * (means[m] * means[j] + correlations[m] * correlations[j])
                 H[j, m] = H[m, j]
             H[m, m] += _LEAST_INFORMATION + (noise * noise * _COUNT if m > 1 else 0.0)
         _invert(H, systems[n])
         for m in range(6):
-            systems[n, 6, m], systems[n, 7, m] = means[m], alike[m]
+            systems[n, 6, m], systems[n, 7, m] = means[m], correlations[m]
         warps[n, 0, 0] = warps[n, 1, 1] = 1.0
         warps[n, 0, 1] = warps[n, 1, 0] = 0.0
-    return rich
+    return textured
 
 
 def fill_templates_numpy(
@@ -144,19 +145,19 @@ def fill_templates_numpy(
     grey = (1.0 - below) * grey[:, :-1] + below * grey[:, 1:]
     inner = grey[:, 1:-1, 1:-1]
     mean, deviation = inner.mean(axis=(1, 2)), inner.std(axis=(1, 2))
-    rich: BoolArray = deviation >= _LEAST_DEVIATION
+    textured: BoolArray = deviation >= _LEAST_DEVIATION
     down, across = np.meshgrid(*[np.arange(-_HALF, _HALF + 1) / _HALF] * 2, indexing="ij")
-    for i in np.flatnonzero(rich):
+    for i in np.flatnonzero(textured):
         T = (inner[i] - mean[i]) / deviation[i]
         dx = 0.5 * (grey[i, 1:-1, 2:] - grey[i, 1:-1, :-2]) / deviation[i]
         dy = 0.5 * (grey[i, 2:, 1:-1] - grey[i, :-2, 1:-1]) / deviation[i]
         padded = np.pad(np.stack([T, dx, dy]), ((0, 0), (0, 0), (0, _ROW - _PX)))
         templates[slots[i]] = padded.reshape(3, -1)
         J = np.stack([dx, dy, dx * across, dx * down, dy * across, dy * down]).reshape(6, -1)
-        means, alike = J.mean(axis=1), J @ T.ravel() / _COUNT
-        rest = J - means[:, None] - np.outer(alike, T)
+        means, correlations = J.mean(axis=1), J @ T.ravel() / _COUNT
+        rest = J - means[:, None] - np.outer(correlations, T)
         held = (_WARP_NOISE_GREY / deviation[i]) ** 2 * _COUNT * np.array([0, 0, 1, 1, 1, 1])
         H = rest @ rest.T + np.diag(held + _LEAST_INFORMATION)
-        systems[slots[i]] = [*np.linalg.inv(H), means, alike]
+        systems[slots[i]] = [*np.linalg.inv(H), means, correlations]
         warps[slots[i]] = np.eye(2)
-    return rich
+    return textured

@@ -19,11 +19,9 @@ difference between recorded samples and path is white and of the size that the c
 
 from __future__ import annotations
 
-import gtsam
 import numpy as np
-from gtsam.symbol_shorthand import B, V, X
 from scipy.optimize import minimize
-from scipy.spatial.transform import Rotation, Slerp
+from scipy.spatial.transform import Rotation
 
 from slam_graph.arrays import FloatArray
 from slam_graph.errors import DataError
@@ -32,57 +30,35 @@ from slam_graph.sensors import (
     ImuData,
     ImuNoise,
 )
-from slam_graph.simulation.motion import GRAVITY
+from slam_graph.simulation.path_batch import PathBatch
 from slam_graph.simulation.path_report import PathReport, report_on
-
-_GRAVITY = -float(GRAVITY[2])
-
-_STATE_SPACING_S = 0.025
-"""Time between the states of the batch; between two of them the path is integrated."""
-
-_MEASUREMENT_SPACING_S = 0.05
-"""Time between the poses of the ground truth that are used. Errors of neighbours are alike."""
-
-_POSITION_SIGMA_M = 3e-3
-_CAUCHY_WIDTH = 3.0
-"""Standard deviation of a true position, and residual (σ) from which the Cauchy loss flattens."""
-
-_ROTATION_SIGMA_RAD = np.deg2rad(3.0)
-"""Standard deviation of a true orientation. The errors last for seconds, over which forty
-orientations count as one: together they weigh as much as one with 0.5°."""
-
-_BIAS_SIGMAS = np.array([0.3] * 3 + [0.1] * 3)
-"""Standard deviation of the first biases: accelerometer (m/s²), gyroscope (rad/s)."""
 
 _LONGEST_GAP_S = 2.5
 """Longest gap of the ground truth that the IMU bridges."""
-
-_ITERATIONS = 15
 
 _LATE_SIGMA_S, _LATEST_S = 0.02, 0.1
 """Standard deviation of the time offset of a ground truth before it is estimated, and its bound."""
 
 _SHORTEST_S = 2.0
-"""A shorter path does not show it."""
+"""A shorter overlap of truth and IMU does not show the time offset."""
 
 _LATE_COST, _LATE_SLOPE = 1e-4, 0.5
-"""The time offset is found when the cost changes by less than this part of it, or by less than
-this per millisecond: a tenth to a fifth of σ."""
+"""The time offset is found when a step changes the cost by less than this part of it, or when the
+slope of the cost is below this per millisecond: a tenth to a fifth of σ."""
 
 _LATE_NOTED_S = 5e-3
-"""Smaller time offsets are not told from other errors of the truth, which move what is found in
-parts of one flight by up to 3.5 ms (V2_01, V2_02). They are left as they are."""
+"""Smaller time offsets are not told from other errors of the truth. These move what is found by up
+to 4 ms in halves of one flight (V1_02, V2_01), and by more in shorter parts."""
 
 _OFFSET_ROUNDS = 10
-_OFFSET_CONVERGED_RAD = np.deg2rad(0.02)
-"""The constant rotation between truth and IMU, and the states, are estimated in turn."""
+"""How often constant rotation between truth and IMU and the states are estimated in turn."""
 
 _NOISE_STREAM = 20260101
 """Seed of the noise: a recorded flight has one path, whatever the seed of the simulation."""
 
 
 def truth_delay_s(truth: Trajectory, imu: ImuData, noise: ImuNoise) -> float:
-    """How much later the positions of a ground truth are than the IMU says; 0 below 5 ms.
+    """How late the stamps of the positions of a ground truth are by the clock of the IMU.
 
     The cost of the best path is a function of this delay. Its slope is nearly that of the cost of
     the positions on a path that stays, as the path is a minimum but for the weak orientations.
@@ -92,20 +68,31 @@ def truth_delay_s(truth: Trajectory, imu: ImuData, noise: ImuNoise) -> float:
         imu: recorded samples; the time that both cover counts.
         noise: calibrated densities of the IMU.
 
+    Returns:
+        Seconds, positive if the stamps are late and negative if they are early. 0 if the delay is
+        below 5 ms, or if truth and IMU overlap for less than 2 s, which is too short to tell.
+
     Raises:
-        DataError: as `consistent_path` does; or if it is 0.1 s or more.
+        DataError: if they overlap for less than a second, a gap of the truth is longer than 2.5 s,
+            no path fits truth and IMU, the delay is 0.1 s or more either way, or the search for
+            it does not converge.
     """
     first, last = _overlap(truth, imu)
-    if (imu.stamps_ns[last - 1] - imu.stamps_ns[first]) * 1e-9 < _SHORTEST_S:
+    # the samples that the truth covers under every delay, so that they are integrated once
+    margin_ns = round(_LATEST_S * 1e9)
+    first, last = np.searchsorted(
+        imu.stamps_ns,
+        [imu.stamps_ns[first] + margin_ns, imu.stamps_ns[last - 1] - margin_ns],
+    ).tolist()
+    if (imu.stamps_ns[last] - imu.stamps_ns[first]) * 1e-9 < _SHORTEST_S:
         return 0.0
-    offset = Rotation.identity()
+    block, offset = imu[first:last], Rotation.identity()
+    batch = PathBatch(truth, block, block, noise)
 
     def cost(late_ms: FloatArray) -> tuple[float, FloatArray]:
         nonlocal offset
         late_s = 1e-3 * float(late_ms[0])
-        moved = at_imu_times(truth, late_s)
-        first, last = _overlap(moved, imu)
-        batch = _Batch(moved, imu[first:last], imu[first:last], noise)
+        batch.measure(at_imu_times(truth, late_s))
         states, offset = batch.solve_with_offset(offset, 2)
         value, slope = batch.cost(states)
         value += 0.5 * (late_s / _LATE_SIGMA_S) ** 2
@@ -125,21 +112,29 @@ def truth_delay_s(truth: Trajectory, imu: ImuData, noise: ImuNoise) -> float:
         raise DataError(
             f"the ground truth is {_LATEST_S} s or more off the IMU's clock; correct its stamps"
         )
+    if not found.success:  # no convergence: what it returns may be anywhere between the bounds
+        raise DataError(
+            "how late the ground truth is by the IMU's clock cannot be found: the search ended at "
+            f"{1e3 * late_s:.1f} ms without convergence ({found.message}); choose another part of "
+            "the flight (start_s, duration_s)"
+        )
     return late_s if abs(late_s) >= _LATE_NOTED_S else 0.0
 
 
 def at_imu_times(truth: Trajectory, late_s: float) -> Trajectory:
-    """A ground truth whose positions are late, with them at the right times.
+    """A ground truth whose positions are late, with stamps by the clock of the IMU.
 
-    Its orientations are not late: against the matches of MH_01's images they fit best as they are,
-    while positions do some 7 ms earlier. So they are interpolated at the times of the positions.
+    Positions keep their values and get earlier stamps. Orientations are taken to be in time, so
+    they are interpolated at the new stamps.
 
     Args:
-        truth: recorded poses.
-        late_s: how much later the times of its positions are than those of the IMU.
+        truth: (N) recorded poses.
+        late_s: how late the stamps of its positions are, as `truth_delay_s` returns it.
 
     Returns:
-        The poses at the times of their positions, without velocities.
+        The poses at the new stamps, without velocities and biases. Those at which no orientation
+        is known (before the first recorded one, after the last, in gaps of more than 5 s) are left
+        out. If `late_s` is 0 it is `truth` itself, with all that it has.
     """
     if late_s == 0.0:
         return truth
@@ -149,7 +144,7 @@ def at_imu_times(truth: Trajectory, late_s: float) -> Trajectory:
 
 
 def consistent_path(
-    truth: Trajectory, imu: ImuData, noise: ImuNoise
+    truth: Trajectory, imu: ImuData, noise: ImuNoise, late_s: float | None = None
 ) -> tuple[Trajectory, PathReport]:
     """The path of a flight that agrees with its IMU and is near its ground truth.
 
@@ -157,18 +152,23 @@ def consistent_path(
         truth: recorded poses of the body (the IMU), at some tens per second or more.
         imu: recorded samples; the path covers the time that both cover.
         noise: calibrated densities of the IMU.
+        late_s: how late the stamps of the positions of the truth are, if it is known; estimated
+            by `truth_delay_s` otherwise. Of a part of a recording it is less certain.
 
     Returns:
         The path at the times of the samples, with velocities and biases, and how it differs from
         both.
 
     Raises:
-        DataError: if they overlap for less than a second, or a gap of the truth is too long.
+        DataError: if they overlap for less than a second, a gap of the truth is longer than 2.5 s,
+            its positions are 0.1 s or more late or early, how late they are cannot be found, or no
+            path fits both.
     """
-    late_s = truth_delay_s(truth, imu, noise)
+    if late_s is None:
+        late_s = truth_delay_s(truth, imu, noise)
     truth = at_imu_times(truth, late_s)
     first, last = _overlap(truth, imu)
-    batch = _Batch(truth, imu[first:last], _with_noise(imu, noise)[first:last], noise)
+    batch = PathBatch(truth, imu[first:last], _with_noise(imu, noise)[first:last], noise)
     states, offset = batch.solve_with_offset(Rotation.identity(), _OFFSET_ROUNDS)
     path = batch.path(states)
     return path, report_on(truth, path, batch.imu, noise, offset, late_s)
@@ -189,183 +189,6 @@ def _overlap(truth: Trajectory, imu: ImuData) -> tuple[int, int]:
             "part of it (start_s, duration_s)"
         )
     return first, last
-
-
-class _States:
-    """Poses, velocities and biases of the batch, K of each."""
-
-    def __init__(self, values: gtsam.Values, count: int) -> None:
-        poses = [values.atPose3(X(k)) for k in range(count)]
-        self.values = values
-        self.positions = np.array([pose.translation() for pose in poses])
-        self.rotations = Rotation.from_matrix([pose.rotation().matrix() for pose in poses])
-        self.velocities = np.array([values.atVector(V(k)) for k in range(count)])
-        self.biases = np.array([values.atConstantBias(B(k)).vector() for k in range(count)])
-
-
-class _Batch:
-    """The least-squares problem over all states of a flight."""
-
-    def __init__(self, truth: Trajectory, imu: ImuData, noisy: ImuData, noise: ImuNoise) -> None:
-        self.truth = truth
-        self.imu = imu
-        self._noisy = noisy
-        self._params = noise.preintegration_params(_GRAVITY)
-        self._seconds = (imu.stamps_ns - imu.stamps_ns[0]) * 1e-9
-        every = max(1, round(_STATE_SPACING_S / float(np.median(np.diff(self._seconds)))))
-        last = len(imu) - 1
-        self._rows = np.unique(np.append(np.arange(0, last, every), last))  # samples with a state
-        self._start = self._initial()
-        self._imu_factors = self._between_states()
-        self._measured = self._used_rows()
-
-    def solve_with_offset(self, offset: Rotation, rounds: int) -> tuple[_States, Rotation]:
-        """States and the rotation path_R_truth of the body, in turn, from a guess of the latter."""
-        for _ in range(rounds):
-            states = self._solve(offset)
-            before, offset = offset, self._rotation_offset(states)
-            if (before.inv() * offset).magnitude() < _OFFSET_CONVERGED_RAD:
-                break
-        return states, offset
-
-    def cost(self, states: _States) -> tuple[float, float]:
-        """Cost of IMU and positions, and its slope over how late the ground truth is, 1/s."""
-        rows, indices = (np.array(column) for column in zip(*self._measured, strict=True))
-        delays = self._state_times()[indices] - self._truth_times()[rows]
-        velocities = np.array([states.values.atVector(V(k)) for k in indices])
-        there = self.truth.positions[rows] + velocities * delays[:, None]
-        residuals = (states.positions[indices] - there) / _POSITION_SIGMA_M
-        squares = np.einsum("ni,ni->n", residuals, residuals) / _CAUCHY_WIDTH**2
-        weighted = residuals / (_POSITION_SIGMA_M * (1.0 + squares[:, None]))
-        cost = self._imu_factors.error(states.values)
-        cost += 0.5 * _CAUCHY_WIDTH**2 * float(np.sum(np.log1p(squares)))
-        return cost, -float(np.sum(weighted * velocities))
-
-    def _solve(self, offset: Rotation) -> _States:
-        """The optimum; `offset` is path_R_truth of the body."""
-        graph = gtsam.NonlinearFactorGraph(self._imu_factors)
-        graph.add(
-            gtsam.PriorFactorConstantBias(
-                B(0), gtsam.imuBias.ConstantBias(), gtsam.noiseModel.Diagonal.Sigmas(_BIAS_SIGMAS)
-            )
-        )
-        cauchy = gtsam.noiseModel.mEstimator.Cauchy.Create(_CAUCHY_WIDTH)
-        position = gtsam.noiseModel.Robust.Create(
-            cauchy, gtsam.noiseModel.Isotropic.Sigma(3, _POSITION_SIGMA_M)
-        )
-        rotation = gtsam.noiseModel.Isotropic.Sigma(3, _ROTATION_SIGMA_RAD)
-        turned = (Rotation.from_quat(self.truth.quaternions) * offset.inv()).as_matrix()
-        for row, state in self._measured:
-            delay_s = self._state_times()[state] - self._truth_times()[row]
-            velocity = self._start.atVector(V(state))
-            there = self.truth.positions[row] + velocity * delay_s
-            graph.add(gtsam.PoseTranslationPrior3D(X(state), there, position))
-            graph.add(gtsam.PoseRotationPrior3D(X(state), gtsam.Rot3(turned[row]), rotation))
-        parameters = gtsam.GaussNewtonParams()
-        parameters.setMaxIterations(_ITERATIONS)
-        parameters.setRelativeErrorTol(1e-4)
-        parameters.setOrderingType("COLAMD")
-        values = gtsam.GaussNewtonOptimizer(graph, self._start, parameters).optimize()
-        self._start = values
-        return _States(values, len(self._rows))
-
-    def _rotation_offset(self, states: _States) -> Rotation:
-        """Mean rotation path_R_truth of the body."""
-        rows, indices = (np.array(column) for column in zip(*self._measured, strict=True))
-        truth = Rotation.from_quat(self.truth.quaternions[rows])
-        return (states.rotations[indices].inv() * truth).mean()
-
-    def path(self, states: _States) -> Trajectory:
-        """The path at all samples: integrated from each state, and led into the next one."""
-        stamps, count = self.imu.stamps_ns, len(self.imu)
-        positions, velocities = np.empty((count, 3)), np.empty((count, 3))
-        quaternions, biases = np.empty((count, 4)), np.empty((count, 6))
-        begin, end = self._rows[:-1], self._rows[1:]
-        p, v, R = states.positions[:-1], states.velocities[:-1], states.rotations[:-1]
-        bias = states.biases[:-1]
-        gravity = np.array([0.0, 0.0, -_GRAVITY])
-        steps = [(begin, p, v, R)]
-        for step in range(int(np.max(end - begin))):
-            row = np.minimum(begin + step, end - 1)
-            live = (begin + step < end)[:, None]
-            dt = np.where(live[:, 0], self._seconds[row + 1] - self._seconds[row], 0.0)[:, None]
-            rate = 0.5 * (self._noisy.gyro[row] + self._noisy.gyro[row + 1]) - bias[:, 3:]
-            force = 0.5 * (self._noisy.accel[row] + self._noisy.accel[row + 1]) - bias[:, :3]
-            half = R * Rotation.from_rotvec(0.5 * rate * dt)
-            acceleration = half.apply(force) + gravity
-            p = p + v * dt + 0.5 * acceleration * dt**2
-            v = v + acceleration * dt
-            R = R * Rotation.from_rotvec(rate * dt)
-            steps.append((np.where(live[:, 0], begin + step + 1, end), p, v, R))
-        # what is left at the end of an interval (far below the noise) is spread evenly over it
-        missing_p, missing_v = states.positions[1:] - p, states.velocities[1:] - v
-        missing_r = (R.inv() * states.rotations[1:]).as_rotvec()
-        for rows, p, v, R in steps:
-            share = ((self._seconds[rows] - self._seconds[begin]) / self._durations())[:, None]
-            positions[rows], velocities[rows] = p + share * missing_p, v + share * missing_v
-            quaternions[rows] = (R * Rotation.from_rotvec(share * missing_r)).as_quat()
-            biases[rows] = (1.0 - share) * bias + share * states.biases[1:]
-        return Trajectory(
-            stamps,
-            positions,
-            quaternions,
-            velocities,
-            accel_biases=biases[:, :3],
-            gyro_biases=biases[:, 3:],
-        )
-
-    def _durations(self) -> FloatArray:
-        return np.diff(self._state_times())
-
-    def _state_times(self) -> FloatArray:
-        times: FloatArray = self._seconds[self._rows]
-        return times
-
-    def _truth_times(self) -> FloatArray:
-        times: FloatArray = (self.truth.stamps_ns - self.imu.stamps_ns[0]) * 1e-9
-        return times
-
-    def _initial(self) -> gtsam.Values:
-        """States from the ground truth: interpolated poses, velocities of its central parts."""
-        at = self._state_times()
-        seconds = self._truth_times()
-        columns = self.truth.positions.T
-        positions = np.stack([np.interp(at, seconds, column) for column in columns], axis=1)
-        ahead, behind = at + _STATE_SPACING_S, at - _STATE_SPACING_S
-        velocities = np.stack(
-            [
-                (np.interp(ahead, seconds, column) - np.interp(behind, seconds, column))
-                / (np.clip(ahead, *seconds[[0, -1]]) - np.clip(behind, *seconds[[0, -1]]))
-                for column in columns
-            ],
-            axis=1,
-        )
-        rotations = Slerp(seconds, Rotation.from_quat(self.truth.quaternions))(at).as_matrix()
-        values = gtsam.Values()
-        for k in range(len(at)):
-            values.insert(X(k), gtsam.Pose3(gtsam.Rot3(rotations[k]), positions[k]))
-            values.insert(V(k), velocities[k])
-            values.insert(B(k), gtsam.imuBias.ConstantBias())
-        return values
-
-    def _between_states(self) -> gtsam.NonlinearFactorGraph:
-        graph = gtsam.NonlinearFactorGraph()
-        zero = gtsam.imuBias.ConstantBias()
-        for k, (first, last) in enumerate(zip(self._rows[:-1], self._rows[1:], strict=True)):
-            pim = self._noisy[int(first) : int(last) + 1].preintegrated(zero, self._params)
-            keys = X(k), V(k), X(k + 1), V(k + 1), B(k), B(k + 1)
-            graph.add(gtsam.CombinedImuFactor(*keys, pim))
-        return graph
-
-    def _used_rows(self) -> list[tuple[int, int]]:
-        """Poses of the ground truth that are measurements, each with the nearest state."""
-        seconds, at = self._truth_times(), self._state_times()
-        wanted = np.arange(at[0], at[-1], _MEASUREMENT_SPACING_S)
-        rows = np.unique(np.searchsorted(seconds, wanted).clip(0, len(seconds) - 1))
-        after = np.searchsorted(at, seconds[rows]).clip(1, len(at) - 1)
-        nearest = after - (seconds[rows] - at[after - 1] < at[after] - seconds[rows])
-        near = np.abs(at[nearest] - seconds[rows]) <= 0.5 * _STATE_SPACING_S
-        return list(zip(rows[near].tolist(), nearest[near].tolist(), strict=True))
 
 
 def _with_noise(imu: ImuData, noise: ImuNoise) -> ImuData:

@@ -18,14 +18,18 @@ from slam_graph.datasets import RecordedSequence, open_dataset, read_groundtruth
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import DataError, closest
 from slam_graph.geometry import Trajectory
-from slam_graph.sensors import ImuData, Rig
-from slam_graph.simulation.imu_consistent_path import consistent_path
+from slam_graph.sensors import ImuData, ImuNoise, Rig
+from slam_graph.simulation.imu_consistent_path import consistent_path, truth_delay_s
 from slam_graph.simulation.motion import Motion, RecordedMotion, SplineMotion
 from slam_graph.simulation.path_report import PathReport
 from slam_graph.simulation.simulation_config import TRAJECTORIES, SimulationConfig
 
 _MARGIN_NS = 3_000_000_000
 """Time before and after the wanted part over which the path is made consistent with the IMU."""
+
+_DELAY_NS = 30_000_000_000
+"""Time over which it is estimated how late the positions of the truth are, at least: in parts of
+14 s of flights that are in time up to 15 ms are found, in those of 26 s up to 4 ms."""
 
 LEAD_NS = 100_000_000
 """Time by which motion and IMU extend beyond the first and last frame."""
@@ -73,7 +77,9 @@ class RecordedFlight:
             return RecordedFlight(path, _part(truth, start_ns, end_ns, path), None, None, None)
         around = _part(truth, start_ns - _MARGIN_NS, end_ns + _MARGIN_NS, path)
         imu = ImuData.concatenate(list(sequence.imu_blocks()))
-        flown, report = consistent_path(around, imu, sequence.rig.imu)
+        longer = _part(truth, *_widened(start_ns, end_ns, truth), path)
+        late_s = _delay_s(longer, imu, sequence.rig.imu)
+        flown, report = consistent_path(around, imu, sequence.rig.imu, late_s)
         poses = _part(flown, start_ns, end_ns, path)
         return RecordedFlight(path, poses, sequence.rig, sequence, report)
 
@@ -97,6 +103,22 @@ class RecordedFlight:
         if not len(data) or data.stamps_ns[0] > motion.start_ns + LEAD_NS:
             raise DataError(f"{self.path}: the recorded IMU does not cover the trajectory")
         return data
+
+
+def _widened(start_ns: int, end_ns: int, truth: Trajectory) -> tuple[int, int]:
+    """Times about a part of the truth that are far enough apart to tell how late it is."""
+    missing_ns = max(0, _DELAY_NS - (end_ns - start_ns))
+    begin_ns = max(int(truth.stamps_ns[0]), start_ns - missing_ns // 2)
+    stop_ns = min(int(truth.stamps_ns[-1]), begin_ns + missing_ns + end_ns - start_ns)
+    return min(begin_ns, max(int(truth.stamps_ns[0]), stop_ns - _DELAY_NS)), stop_ns
+
+
+def _delay_s(truth: Trajectory, imu: ImuData, noise: ImuNoise) -> float | None:
+    """How late positions are; None if a gap, perhaps beside the part that is flown, hides it."""
+    try:
+        return truth_delay_s(truth, imu, noise)
+    except DataError:
+        return None
 
 
 def _part(truth: Trajectory, start_ns: int, end_ns: int, path: Path) -> Trajectory:
