@@ -18,6 +18,7 @@ from slam_graph.sensors import ImuData
 from slam_graph.simulation import imu_consistent_path, simulate
 from slam_graph.simulation.imu_consistent_path import at_imu_times, consistent_path, truth_delay_s
 from slam_graph.simulation.path_report import PathReport
+from slam_graph.simulation.recorded_flight import delay_s, widened
 from slam_graph.simulation.simulated_sequence import Flight
 
 JUMP_AT_S, DRIFT_S, JUMP_M = 12.0, 1.5, 0.08
@@ -120,10 +121,11 @@ def test_a_truth_far_off_the_clock_of_the_imu_is_refused(late_s: float) -> None:
         consistent_path(truth, imu, flight.rig.imu)
 
 
-def test_two_seconds_are_too_short_to_tell_how_late_a_truth_is() -> None:
+def test_less_than_ten_seconds_are_too_short_to_tell_how_late_a_truth_is() -> None:
     flight, path, imu = flown()
-    truth = part(late(path, 0.03), 8.0, 9.9)
-    assert truth_delay_s(truth, imu, flight.rig.imu) == 0.0
+    truth = late(path, 0.03)
+    assert truth_delay_s(part(truth, 8.0, 17.9), imu, flight.rig.imu) == 0.0
+    assert truth_delay_s(part(truth, 7.8, 18.0), imu, flight.rig.imu) != 0.0
 
 
 def test_positions_are_taken_earlier_and_orientations_are_not() -> None:
@@ -158,6 +160,31 @@ def test_a_report_says_whether_positions_were_late_or_early(late_s: float, words
         accel_correlation=0.0,
     )
     assert report.lines()["positions of the truth"] == words
+
+
+@pytest.mark.parametrize(
+    ("part_s", "wider_s"),
+    [((0, 8), (0, 30)), ((40, 48), (29, 59)), ((75, 80), (50, 80)), ((10, 50), (10, 50))],
+)
+def test_a_delay_is_that_of_thirty_seconds_about_a_part(
+    part_s: tuple[int, int], wider_s: tuple[int, int]
+) -> None:
+    stamps = np.arange(0, 81) * 1_000_000_000
+    truth = Trajectory(stamps, np.zeros((81, 3)), np.tile([0.0, 0.0, 0.0, 1.0], (81, 1)))
+    begin, end = (second * 1_000_000_000 for second in part_s)
+    assert widened(begin, end, truth) == tuple(second * 1_000_000_000 for second in wider_s)
+    short = part(truth, 0.0, 20.0)  # there is no more
+    assert widened(5_000_000_000, 8_000_000_000, short) == (0, 20_000_000_000)
+
+
+def test_a_gap_beside_a_part_leaves_the_delay_to_the_part() -> None:
+    flight, path, imu = flown()
+    truth = late(path, LATE_S)
+    seconds = (truth.stamps_ns - truth.stamps_ns[0]) * 1e-9
+    there = (seconds < 3.0) | (seconds > 6.0)
+    with_gap = Trajectory(truth.stamps_ns[there], truth.positions[there], truth.quaternions[there])
+    assert delay_s(with_gap, imu, flight.rig.imu) is None
+    assert delay_s(truth, imu, flight.rig.imu) == pytest.approx(LATE_S, abs=1e-3)
 
 
 def test_a_search_that_does_not_converge_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -107,7 +107,12 @@ def test_errors_that_last_count_for_more_than_their_size(tracks: Tracks) -> None
 
 
 def learned(tracks: Tracks, sigmas: tuple[float, float], config: NoiseConfig) -> FloatArray:
-    """What is found in tracks of two cameras at true poses, each with its own noise."""
+    """What is used of what is found in tracks of two cameras, each with its own noise."""
+    return after(tracks, sigmas, config).sigma_px
+
+
+def after(tracks: Tracks, sigmas: tuple[float, float], config: NoiseConfig) -> PixelNoise:
+    """The noise as it is known after tracks of two cameras at true poses."""
     obs, truth, _ = tracks
     rng = np.random.default_rng(6)
     state = State()
@@ -125,7 +130,7 @@ def learned(tracks: Tracks, sigmas: tuple[float, float], config: NoiseConfig) ->
         some = rng.random(len(obs.ids)) < 0.1
         features = TrackFeatures(noisy, truth.points, np.zeros(len(obs.ids), np.bool_))
         noise.learn(cost, features.subset(some), step * 50_000_000)
-    return noise.sigma_px
+    return noise
 
 
 def test_each_camera_has_its_noise_within_bounds(tracks: Tracks) -> None:
@@ -133,12 +138,22 @@ def test_each_camera_has_its_noise_within_bounds(tracks: Tracks) -> None:
     np.testing.assert_allclose(learned(tracks, (0.5, 2.0), on), [0.5, 2.0], rtol=0.08)
     np.testing.assert_allclose(learned(tracks, (0.05, 0.05), on), [0.25, 0.25])
     np.testing.assert_allclose(learned(tracks, (20.0, 20.0), on), [4.0, 4.0])
+    assert NoiseConfig().adaptive_pixels == "clear"
     for choice, smaller in (("clear", 0.5), ("larger", 1.0)):
         config = NoiseConfig.model_validate({"adaptive_pixels": choice})
         np.testing.assert_allclose(learned(tracks, (0.5, 2.0), config), [smaller, 2.0], rtol=0.08)
         np.testing.assert_array_equal(learned(tracks, (1.1, 0.9), config), [1.0, 1.0])
     never = NoiseConfig(adaptive_pixels="never")
     np.testing.assert_array_equal(learned(tracks, (0.5, 2.0), never), [1.0, 1.0])
+
+
+def test_what_is_found_does_not_depend_on_what_is_used(tracks: Tracks) -> None:
+    found = [
+        after(tracks, (0.5, 2.0), NoiseConfig.model_validate({"adaptive_pixels": choice}))
+        for choice in ("larger", "clear", "any")
+    ]
+    np.testing.assert_array_equal(found[0].estimate_px, found[2].estimate_px)
+    np.testing.assert_array_equal(found[1].estimate_px, found[2].estimate_px)
 
 
 def test_tracks_that_have_hardly_moved_say_nothing(

@@ -168,13 +168,12 @@ def test_a_patch_is_given_up_where_its_area_or_its_shape_changes_too_much(
     for k in range(1, steps + 1):
         share = tuple(factor ** (k / steps) for factor in factors)
         now, true = scaled(image, tracks, (share[0], share[1]))
-        found = placed_from(patches, tracks, now, true)
+        placed_from(patches, tracks, now, true)
     # from off its place a feature is moved back by its first patch, and to no other
     again = placed_from(patches, tracks, now, true + off)
     inner = np.all((true > 20) & (true < np.array([WIDTH, HEIGHT]) - 20), axis=1)
     errors_px = np.linalg.norm(again - true, axis=1)[inner]
     assert (np.median(errors_px) > 0.2) == given_up
-    assert len(found) == len(tracks)
 
 
 def test_one_image_without_the_patch_does_not_replace_it_and_three_do() -> None:
@@ -214,4 +213,4 @@ def test_patches_of_features_that_do_not_come_back_are_dropped() -> None:
     for k in range(130):
         ids = tracks.ids + k * len(tracks)
         placed_from(patches, _tracks(image, ids, tracks.pixels), image, tracks.pixels)
-    assert patches.count <= 101 * len(tracks)
+    assert 95 * len(tracks) < patches.count <= 101 * len(tracks)

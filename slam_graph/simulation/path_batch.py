@@ -41,7 +41,15 @@ _OFFSET_CONVERGED_RAD = np.deg2rad(0.02)
 
 
 class PathStates:
-    """Poses, velocities and biases of the batch, K of each."""
+    """Poses, velocities and biases of the batch, K of each.
+
+    Attributes:
+        values: the same as GTSAM has them.
+        positions: (K, 3) of the body in the world, m.
+        rotations: K of the body, world_R_body.
+        velocities: (K, 3) in the world, m/s.
+        biases: (K, 6) of accelerometer (m/s²) and gyroscope (rad/s).
+    """
 
     def __init__(self, values: gtsam.Values, count: int) -> None:
         poses = [values.atPose3(X(k)) for k in range(count)]
@@ -56,6 +64,14 @@ class PathBatch:
     """The least-squares problem over all states of a flight."""
 
     def __init__(self, truth: Trajectory, imu: ImuData, noisy: ImuData, noise: ImuNoise) -> None:
+        """Integrate the samples between states.
+
+        Args:
+            truth: poses that cover all samples.
+            imu: N samples as they were recorded.
+            noisy: the same samples as they are integrated.
+            noise: calibrated densities.
+        """
         self.truth = truth
         self.imu = imu
         self._noisy = noisy
@@ -74,7 +90,15 @@ class PathBatch:
         self._measured = self._used_rows()
 
     def solve_with_offset(self, offset: Rotation, rounds: int) -> tuple[PathStates, Rotation]:
-        """States and the rotation path_R_truth of the body, in turn, from a guess of the latter."""
+        """States and the rotation path_R_truth of the body, in turn.
+
+        Args:
+            offset: a guess of the rotation.
+            rounds: how often both are estimated at most.
+
+        Raises:
+            DataError: if no path fits.
+        """
         for _ in range(rounds):
             states = self._solve(offset)
             before, offset = offset, self._rotation_offset(states)
@@ -136,7 +160,7 @@ class PathBatch:
         return (states.rotations[indices].inv() * truth).mean()
 
     def path(self, states: PathStates) -> Trajectory:
-        """The path at all samples: integrated from each state, and led into the next one."""
+        """The path at all N samples: integrated from each state, and bent to end in the next."""
         stamps, count = self.imu.stamps_ns, len(self.imu)
         positions, velocities = np.empty((count, 3)), np.empty((count, 3))
         quaternions, biases = np.empty((count, 4)), np.empty((count, 6))

@@ -19,7 +19,7 @@ from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import DataError, closest
 from slam_graph.geometry import Trajectory
 from slam_graph.sensors import ImuData, ImuNoise, Rig
-from slam_graph.simulation.imu_consistent_path import consistent_path, truth_delay_s
+from slam_graph.simulation.imu_consistent_path import consistent_path, overlap, truth_delay_s
 from slam_graph.simulation.motion import Motion, RecordedMotion, SplineMotion
 from slam_graph.simulation.path_report import PathReport
 from slam_graph.simulation.simulation_config import TRAJECTORIES, SimulationConfig
@@ -58,7 +58,8 @@ class RecordedFlight:
         """Read the part of the recording at `path` that the settings ask for.
 
         Raises:
-            DataError: if there is no such file, or no IMU although `real_imu` is set.
+            DataError: if there is no such file, or no IMU although `real_imu` is set; or if no
+                path fits ground truth and IMU (`consistent_path`).
         """
         if not path.exists():
             raise DataError(f"{path}: no such trajectory; {closest(str(path), TRAJECTORIES)}")
@@ -77,8 +78,8 @@ class RecordedFlight:
             return RecordedFlight(path, _part(truth, start_ns, end_ns, path), None, None, None)
         around = _part(truth, start_ns - _MARGIN_NS, end_ns + _MARGIN_NS, path)
         imu = ImuData.concatenate(list(sequence.imu_blocks()))
-        longer = _part(truth, *_widened(start_ns, end_ns, truth), path)
-        late_s = _delay_s(longer, imu, sequence.rig.imu)
+        longer = _part(truth, *widened(start_ns, end_ns, truth), path)
+        late_s = delay_s(longer, imu, sequence.rig.imu)
         flown, report = consistent_path(around, imu, sequence.rig.imu, late_s)
         poses = _part(flown, start_ns, end_ns, path)
         return RecordedFlight(path, poses, sequence.rig, sequence, report)
@@ -105,7 +106,7 @@ class RecordedFlight:
         return data
 
 
-def _widened(start_ns: int, end_ns: int, truth: Trajectory) -> tuple[int, int]:
+def widened(start_ns: int, end_ns: int, truth: Trajectory) -> tuple[int, int]:
     """Times about a part of the truth that are far enough apart to tell how late it is."""
     missing_ns = max(0, _DELAY_NS - (end_ns - start_ns))
     begin_ns = max(int(truth.stamps_ns[0]), start_ns - missing_ns // 2)
@@ -113,12 +114,13 @@ def _widened(start_ns: int, end_ns: int, truth: Trajectory) -> tuple[int, int]:
     return min(begin_ns, max(int(truth.stamps_ns[0]), stop_ns - _DELAY_NS)), stop_ns
 
 
-def _delay_s(truth: Trajectory, imu: ImuData, noise: ImuNoise) -> float | None:
+def delay_s(truth: Trajectory, imu: ImuData, noise: ImuNoise) -> float | None:
     """How late positions are; None if a gap, perhaps beside the part that is flown, hides it."""
     try:
-        return truth_delay_s(truth, imu, noise)
+        overlap(truth, imu)
     except DataError:
         return None
+    return truth_delay_s(truth, imu, noise)
 
 
 def _part(truth: Trajectory, start_ns: int, end_ns: int, path: Path) -> Trajectory:

@@ -52,7 +52,7 @@ _MAX_RATIO = 4.0
 _DRIFT_STEPS = 2
 """One step of so many asks how far tracks slide off their points: it takes time."""
 _CLEARLY = 1.25
-"""Ratio of the estimate to the setting, or of the setting to the estimate, that is no chance."""
+"""Ratio of the estimate to the setting, or the inverse, from which the estimate is used."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
