@@ -151,7 +151,8 @@ class PixelNoise:
         self.estimate_px = np.clip(sigma_px, setting / _MAX_RATIO, setting * _MAX_RATIO)
         self._squares = self._dof * self.estimate_px**2  # what is beyond does not pile up
         taken = self.estimate_px > _CLEARLY * setting
-        if self._config.adaptive_pixels in {"clear", "any"}:
+        # where tracks drift their errors last for longer than the blocks are
+        if self._config.adaptive_pixels == "clear" and self.drift.sigma_px == 0.0:
             taken |= self.estimate_px < setting / _CLEARLY
         taken |= self._config.adaptive_pixels == "any"
         self.sigma_px = np.where(taken, self.estimate_px, setting)
