@@ -147,6 +147,15 @@ def test_each_camera_has_its_noise_within_bounds(tracks: Tracks) -> None:
     np.testing.assert_array_equal(learned(tracks, (0.5, 2.0), never), [1.0, 1.0])
 
 
+@pytest.mark.parametrize(("drift_px", "sigma_px"), [(0.01, 0.25), (0.1, 0.635), (0.2, 1.0)])
+def test_no_less_is_used_than_the_drift_of_a_window(
+    tracks: Tracks, drift_px: float, sigma_px: float
+) -> None:
+    """The mean of n steps of a random walk has the variance n / 3, that of white noise 1 / n."""
+    config = NoiseConfig(drift_px=drift_px, adaptive_drift=False)
+    np.testing.assert_allclose(learned(tracks, (0.05, 0.05), config), sigma_px, rtol=1e-3)
+
+
 def test_what_is_found_does_not_depend_on_what_is_used(tracks: Tracks) -> None:
     found = [
         after(tracks, (0.5, 2.0), NoiseConfig.model_validate({"adaptive_pixels": choice}))

@@ -49,9 +49,9 @@ class NoiseConfig(Settings):
     """White noise of the IMU that is estimated from how the images correct its predictions."""
     adaptive_pixels: Literal["never", "larger", "clear", "any"] = expert("clear")
     """Estimate the noise of the observations of each camera from the residuals of tracks, between
-    a quarter of `pixel_sigma` and four times that. clear: take it where it is 1.25 times as large
-    or more, or as small and tracks do not drift. larger: only where it is so much larger. any:
-    always. never: take `pixel_sigma`, as GTSAM's smoothers always do."""
+    a quarter of `pixel_sigma` and four times that, and not less than their drift makes up. clear:
+    take it where it is 1.25 times as large or as small, or more. larger: only where it is so much
+    larger. any: always. never: take `pixel_sigma`, as GTSAM's smoothers always do."""
     drift_px: float = expert(0.0, ge=0)
     """How far tracks drift off their points in one frame, in pixels along each axis: √n times as
     far in n frames. It is process noise of the features in the state."""

@@ -47,6 +47,9 @@ _PRIOR_DOF = 50.0
 """Degrees of freedom that the setting counts for at the start."""
 _QUANTILE = 0.95
 """Of the distribution of a track's sum, where the sum is cut off."""
+_WALK = _MIN_OBSERVATIONS / np.sqrt(3.0)
+"""White noise that is as large, in the mean of so many observations, as a random walk from the
+first of them on, in steps of the walk."""
 _MAX_RATIO = 4.0
 """Largest ratio of the estimate to the setting, and of the setting to the estimate."""
 _DRIFT_STEPS = 2
@@ -150,12 +153,14 @@ class PixelNoise:
         sigma_px = np.sqrt(self._squares / self._dof)
         self.estimate_px = np.clip(sigma_px, setting / _MAX_RATIO, setting * _MAX_RATIO)
         self._squares = self._dof * self.estimate_px**2  # what is beyond does not pile up
-        taken = self.estimate_px > _CLEARLY * setting
-        # where tracks drift their errors last for longer than the blocks are
-        if self._config.adaptive_pixels == "clear" and self.drift.sigma_px == 0.0:
-            taken |= self.estimate_px < setting / _CLEARLY
+        # a random walk that lasts for longer than the blocks is more than they show
+        least = min(setting, _WALK * self.drift.sigma_px)
+        shown = np.maximum(self.estimate_px, least)
+        taken = shown > _CLEARLY * setting
+        if self._config.adaptive_pixels == "clear":
+            taken |= shown < setting / _CLEARLY
         taken |= self._config.adaptive_pixels == "any"
-        self.sigma_px = np.where(taken, self.estimate_px, setting)
+        self.sigma_px = np.where(taken, shown, setting)
 
 
 def _extents_px(obs: Observations, cameras: int) -> FloatArray:
