@@ -222,4 +222,7 @@ def spread(pixels: Pixels, count: int, distance_px: float) -> IntArray:
 
 def contiguous(image: Image) -> Image:
     """The image as kernels take it, contiguous and writable: itself if it is, otherwise a copy."""
+    flags = image.flags
+    if flags.c_contiguous and flags.writeable:  # as it mostly is; `require` takes longer to see it
+        return image
     return np.require(image, requirements=("C", "W"))

@@ -71,13 +71,11 @@ class ReferencePatches:
             points: (N, 2) where these were tracked to, in pixels.
             good: (N,) which of them were tracked; others stay where they are.
         """
-        assert before.image is not None
         self._image += 1
         self._remove(self._last_tracked[self._slots] < self._image - _KEPT_IMAGES)
-        new = np.flatnonzero(~are_among(before.ids, self._ids))
-        self._add(before.image, before.ids[new], before.pixels[new])
-        rows = np.flatnonzero(good & are_among(before.ids, self._ids))
-        slots = self._slots[np.searchsorted(self._ids, before.ids[rows])]
+        own = self._slots_of(before)
+        rows = np.flatnonzero(good & (own >= 0))
+        slots = own[rows]
         places, warps = points[rows].astype(np.float64), self._warps[slots]
         found, correlations = align_patches(
             contiguous(image),
@@ -85,15 +83,18 @@ class ReferencePatches:
             *(places, _ITERATIONS, _STEP_PX),
         )
         found &= correlations > _LEAST_CORRELATION
-        self._warps[slots[~found]] = warps[~found]
+        lost = np.flatnonzero(~found)
+        self._warps[slots[lost]] = warps[lost]
         changed = _view_has_changed(self._warps[slots])
         found &= ~changed
-        points = points.copy()
-        points[rows[found]] = places[found]
+        points, placed = points.copy(), np.flatnonzero(found)
+        points[rows[placed]] = places[placed]
         self._last_tracked[slots] = self._image
-        self._refusals[slots] = np.where(found, 0, self._refusals[slots] + 1)
-        given_up = changed | (self._refusals[slots] >= _MOST_REFUSALS)
-        self._remove(are_among(self._ids, before.ids[rows[given_up]]))  # new ones in the next image
+        refusals = np.where(found, 0, self._refusals[slots] + 1)
+        self._refusals[slots] = refusals
+        given_up = changed | (refusals >= _MOST_REFUSALS)
+        if given_up.any():  # they get new ones in the next image
+            self._remove(are_among(self._ids, before.ids[rows[given_up]]))
         return points
 
     def forget(self, ids: IntArray) -> None:
@@ -101,22 +102,43 @@ class ReferencePatches:
         self._remove(are_among(self._ids, np.sort(np.asarray(ids, np.int64))))
 
     def _remove(self, which: BoolArray) -> None:
-        self._free += self._slots[which].tolist()
-        self._ids, self._slots = self._ids[~which], self._slots[~which]
+        if which.any():
+            self._free += self._slots[which].tolist()
+            self._ids, self._slots = self._ids[~which], self._slots[~which]
 
-    def _add(self, image: Image, ids: IntArray, pixels: Pixels) -> None:
-        """Take the patches around pixels (N, 2) of an image, where it has enough contrast."""
-        within = inside(pixels, image.shape, _HALF + 3)
-        ids, slots = ids[within], self._taken(int(np.count_nonzero(within)))
+    def _slots_of(self, tracks: Tracks) -> IntArray:
+        """Where the patches of features are (N,), after those without one got one; else -1."""
+        assert tracks.image is not None
+        slots = np.full(len(tracks), -1)
+        if len(self._ids):
+            at = self._ids.searchsorted(tracks.ids)
+            same = self._ids.take(at, mode="clip") == tracks.ids
+            slots = np.where(same, self._slots.take(at, mode="clip"), -1)
+        new = np.flatnonzero(slots < 0)
+        if len(new):
+            slots[new] = self._add(tracks.image, tracks.ids[new], tracks.pixels[new])
+        return slots
+
+    def _add(self, image: Image, ids: IntArray, pixels: Pixels) -> IntArray:
+        """Take the patches around pixels (N, 2) of an image, where it has enough contrast.
+
+        Returns:
+            (N,) where they are; -1 where none was taken.
+        """
+        within = np.flatnonzero(inside(pixels, image.shape, _HALF + 3))
+        slots = self._taken(len(within))
         room = self._templates, self._systems, self._warps
-        pixels = np.ascontiguousarray(pixels[within], np.float32)
-        textured = fill_templates(contiguous(image), pixels, slots, *room)
+        middles = np.ascontiguousarray(pixels[within], np.float32)
+        textured = fill_templates(contiguous(image), middles, slots, *room)
         self._free += slots[~textured].tolist()
-        ids, slots = ids[textured], slots[textured]
+        taken, slots = within[textured], slots[textured]
         self._refusals[slots], self._last_tracked[slots] = 0, self._image
-        ids, slots = np.concatenate([self._ids, ids]), np.concatenate([self._slots, slots])
-        order = np.argsort(ids, kind="stable")
-        self._ids, self._slots = ids[order], slots[order]
+        kept = np.concatenate([self._ids, ids[taken]])
+        order = np.argsort(kept, kind="stable")
+        self._ids, self._slots = kept[order], np.concatenate([self._slots, slots])[order]
+        result = np.full(len(ids), -1)
+        result[taken] = slots
+        return result
 
     def _taken(self, count: int) -> IntArray:
         """So many slots that were free; there are more if need be."""
