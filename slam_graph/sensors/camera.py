@@ -78,6 +78,16 @@ class Camera:
         return np.array([self.fx, self.fy, self.cx, self.cy])
 
     @cached_property
+    def _focal(self) -> FloatArray:
+        """(fx, fy) in pixels."""
+        return np.array([self.fx, self.fy])
+
+    @cached_property
+    def _center(self) -> FloatArray:
+        """(cx, cy) in pixels."""
+        return np.array([self.cx, self.cy])
+
+    @cached_property
     def max_tangent(self) -> float:
         """Length of the longest normalised point in the model's valid field of view."""
         return self.model.max_tangent(self.coefficients)
@@ -97,13 +107,12 @@ class Camera:
             jacobian: (N, 2, 2), d pixel / d normalized.
         """
         q, jacobian = self.model.distort(normalized, self.coefficients)
-        focal = np.array([self.fx, self.fy])
-        return q * focal + (self.cx, self.cy), jacobian * focal[:, None]
+        return q * self._focal + self._center, jacobian * self._focal[:, None]
 
     def pixels(self, normalized: FloatArray) -> FloatArray:
         """Pixels (N, 2) of normalised points (N, 2), in less time than with the derivative."""
         q = self.model.points(normalized, self.coefficients)
-        return np.asarray(q * np.array([self.fx, self.fy]) + (self.cx, self.cy))
+        return np.asarray(q * self._focal + self._center)
 
     def project(self, points: FloatArray) -> FloatArray:
         """Pixels (N, 2) of points (N, 3) in the camera frame; the points must have z > 0."""
@@ -133,7 +142,7 @@ class Camera:
         """
         if len(pixels) == 0:
             return np.zeros((0, 2))
-        q = (pixels - (self.cx, self.cy)) / (self.fx, self.fy)
+        q = (pixels - self._center) / self._focal
         return self.model.undistort(q, self.coefficients, near)
 
     def within_reach(self, normalized: FloatArray, max_coordinate: float) -> BoolArray:
@@ -147,7 +156,8 @@ class Camera:
         """
         if self.model.sees_sideways:
             return np.asarray(np.linalg.norm(normalized, axis=1) < self.max_tangent)
-        return np.asarray(np.all(np.abs(normalized) < max_coordinate, axis=1))
+        near = np.abs(normalized) < max_coordinate
+        return np.asarray(near[:, 0] & near[:, 1])
 
     def visible(
         self, pixels: FloatArray, max_tangent: float = MAX_TANGENT

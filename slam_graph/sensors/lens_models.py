@@ -141,9 +141,9 @@ class RadialTangential(_SolvedInTwoSteps):
         from slam_graph.kernels.undistortion import approach_radtan  # which imports Numba
 
         m = approach_radtan(q, coefficients, _ROUGH_ITERATIONS, _ROUGH_EPSILON)
-        left, eye = np.isnan(m[:, 0]), np.eye(3)
+        left = np.isnan(m[:, 0])
         if left.any():
-            points = q[left][:, None, :]
+            points, eye = q[left][:, None, :], np.eye(3)
             found = cv2.undistortPointsIter(points, eye, coefficients, eye, eye, _CRITERIA)
             m[left] = np.asarray(found, np.float64)[:, 0, :]
         return m
