@@ -177,20 +177,18 @@ class PointPredictor:
         """
         if self._mode == "none" or len(before) == 0:
             return Prediction(before.pixels, np.zeros(len(before), np.bool_))
-        trusted: BoolArray = np.isfinite(before.residual_flow[:, 0]) & self.rotation_known
+        flow, seconds = before.residual_flow, (stamp_ns - before.stamp_ns) * 1e-9
+        trusted: BoolArray = np.isfinite(flow[:, 0]) & self.rotation_known
         start = self.unrolled(before.pixels, before.normalized, before.stamp_ns)
-        m = self._rotated(start)
-        m = m + np.nan_to_num(before.residual_flow) * ((stamp_ns - before.stamp_ns) * 1e-9)
+        m = self._rotated(start) + np.where(np.isnan(flow), 0.0, flow) * seconds
         if self._mode == "state":
             known, by_map = self._by_map(before.ids, stamp_ns, feedback)
             m[known], trusted[known] = by_map[known], True
         sane = self._camera.within_reach(m, MAX_TANGENT)
-        pixels = before.pixels.copy()
-        pixels[sane] = self._rolled(m[sane], stamp_ns)
-        size = np.array([self._camera.width - 1, self._camera.height - 1])
-        outside = np.any((pixels < 0) | (pixels > size), axis=1)
-        pixels[outside] = before.pixels[outside]
-        return Prediction(pixels, trusted & sane & ~outside)
+        pixels = self._rolled(np.where(sane[:, None], m, 0.0), stamp_ns).astype(np.float32)
+        (u, v), last_u, last_v = pixels.T, self._camera.width - 1, self._camera.height - 1
+        sane &= ~((u < 0) | (v < 0) | (u > last_u) | (v > last_v))
+        return Prediction(np.where(sane[:, None], pixels, before.pixels), trusted & sane)
 
     def body_pose(self, stamp_ns: int) -> gtsam.Pose3 | None:
         """world_T_body at a time of the camera; None where it is not known."""
@@ -257,7 +255,9 @@ class PointPredictor:
         """Normalised points (N, 2) after the rotation of the camera; `flow` leaves it out."""
         if self._mode == "flow":
             return normalized.copy()
-        rays = np.column_stack([normalized, np.ones(len(normalized))]) @ self.camera_R.T
+        rays = np.ones((len(normalized), 3))
+        rays[:, :2] = normalized
+        rays = rays @ self.camera_R.T
         turned: FloatArray = rays[:, :2] / np.maximum(rays[:, 2:], 1e-3)
         return turned
 
@@ -289,5 +289,5 @@ def neighbour_flow(start: Pixels, end: Pixels, at: Pixels) -> Pixels:
     if len(start) < _NEIGHBOURS:
         return np.zeros_like(at)
     neighbours = nearest(np.ascontiguousarray(start), np.ascontiguousarray(at), _NEIGHBOURS)
-    ascending = np.sort((end - start)[neighbours], axis=1)
+    ascending = np.sort((end - start).take(neighbours, axis=0), axis=1)
     return np.asarray(ascending[:, _NEIGHBOURS // 2], np.float32)
