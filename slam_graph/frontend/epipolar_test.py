@@ -104,7 +104,8 @@ class EpipolarTest:
             return direction_inliers(before, after, R, focal_px, config, self._rng, scale)
         order = self._rng.permutation(len(before))
         inlier = np.empty(len(before), np.bool_)
-        inlier[order] = fundamental_inliers(before[order], after[order], focal_px, config, scale)
+        shuffled = before.take(order, axis=0), after.take(order, axis=0)
+        inlier[order] = fundamental_inliers(*shuffled, focal_px, config, scale)
         return inlier
 
     def _wide_inliers(

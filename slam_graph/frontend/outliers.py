@@ -89,14 +89,16 @@ def fundamental_inliers(
     if result is None:
         return np.ones(len(before), np.bool_)
     # A model of a few noisy points misses inliers that one of all inliers so far fits
+    count = np.count_nonzero(result)
     for _ in range(2):
-        if np.count_nonzero(result) < MIN_POINTS:
+        if count < MIN_POINTS:
             break
-        F = eight_point(before[result], after[result])
+        F = eight_point(before.compress(result, axis=0), after.compress(result, axis=0))
         refined: BoolArray = epipolar_distance(F, before, after) * focal_px < tolerance_px
-        if np.count_nonzero(refined) <= np.count_nonzero(result):
+        more = np.count_nonzero(refined)
+        if more <= count:
             break
-        result = refined
+        result, count = refined, more
     return result
 
 
@@ -256,7 +258,8 @@ def eight_point(m_a: FloatArray, m_b: FloatArray) -> FloatArray:
     # OpenCV's solvers of small matrices take a quarter of the time of LAPACK's in NumPy
     _, _, vectors = cv2.eigen(constraint_moments(_contiguous(m_a), _contiguous(m_b)))
     s, U, Vt = cv2.SVDecomp(vectors[8].reshape(3, 3))
-    F: FloatArray = (U * [s[0, 0], s[1, 0], 0.0]) @ Vt
+    s[2, 0] = 0.0
+    F: FloatArray = (U * s.T) @ Vt
     return F
 
 
