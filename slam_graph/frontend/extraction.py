@@ -99,6 +99,7 @@ class FeatureExtractor:
         allowed = np.zeros((height, width), np.uint8)
         allowed[BORDER_PX : height - BORDER_PX, BORDER_PX : width - BORDER_PX] = 255
         self._allowed = allowed if mask is None else np.where(mask >= 128, allowed, np.uint8(0))
+        self._room = np.empty_like(self._allowed)
         self._half_widths = _disk(round(self._distance_px))
         self._rest = np.zeros(len(self._cells), np.int64)
         self._apart: Pixels = np.zeros((0, 2), np.float32)
@@ -106,7 +107,7 @@ class FeatureExtractor:
     def allows(self, points: Pixels) -> BoolArray:
         """Which points (N, 2), all inside the image, the mask allows."""
         u, v = np.rint(points).astype(int).T
-        result: BoolArray = self._allowed[v, u] > 0
+        result: BoolArray = self._allowed.take(v * self._allowed.shape[1] + u) > 0
         return result
 
     def count_apart(self, points: Pixels) -> None:
@@ -212,13 +213,14 @@ class FeatureExtractor:
         """How many points (N, 2) lie in each cell."""
         xs, ys = self._edges
         columns, rows = self._config.grid
-        column = np.searchsorted(xs[1:-1], points[:, 0], side="right")
-        row = np.searchsorted(ys[1:-1], points[:, 1], side="right")
+        column = xs[1:-1].searchsorted(points[:, 0], side="right")
+        row = ys[1:-1].searchsorted(points[:, 1], side="right")
         return np.bincount(row * columns + column, minlength=columns * rows)
 
     def _free(self, occupied: Pixels) -> Image:
-        """The mask of pixels where a new point may lie."""
-        free = self._allowed.copy()
+        """The mask of pixels where a new point may lie, until the next call."""
+        free = self._room  # a new array of this size would cost as much as what is done with it
+        np.copyto(free, self._allowed)
         clear_disks(free, np.ascontiguousarray(occupied), self._half_widths)
         return free
 
@@ -238,11 +240,11 @@ class FeatureExtractor:
         height, width = image.shape
         left, top = max(0, cell.left - _MARGIN_PX), max(0, cell.top - _MARGIN_PX)
         right, bottom = min(width, cell.right + _MARGIN_PX), min(height, cell.bottom + _MARGIN_PX)
-        allowed = np.zeros((bottom - top, right - left), np.uint8)
-        inner = np.s_[cell.top - top : cell.bottom - top, cell.left - left : cell.right - left]
-        allowed[inner] = free[cell.top : cell.bottom, cell.left : cell.right]
-        if not allowed.any():
+        inner = free[cell.top : cell.bottom, cell.left : cell.right]
+        if cv2.countNonZero(inner) == 0:
             return Keypoints.concatenate([])
+        allowed = np.zeros((bottom - top, right - left), np.uint8)
+        allowed[cell.top - top : cell.bottom - top, cell.left - left : cell.right - left] = inner
         patch = np.ascontiguousarray(image[top:bottom, left:right])
         found = self._detector.detect(patch, allowed, count, self._distance_px)
         return found.at(found.pixels + np.array([left, top], np.float32))
