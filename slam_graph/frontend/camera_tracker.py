@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from functools import partial
+from functools import partial, reduce
 
 import numpy as np
 from scipy.spatial.distance import cdist
@@ -22,6 +22,7 @@ from slam_graph.frontend.lucas_kanade import BLUR_PER_PX
 from slam_graph.frontend.moving_tracks import MovingTracks
 from slam_graph.frontend.outliers import MIN_POINTS, coherent_groups, map_inliers
 from slam_graph.frontend.prediction import MAX_TANGENT, PointPredictor
+from slam_graph.kernels.ascending import are_among
 from slam_graph.kernels.spacing import apart
 from slam_graph.sensors import RigCamera
 
@@ -93,17 +94,20 @@ class CameraTracker:
                     self._lost.turn(turn)
             guess = self._predictor.predict(before, stamp_ns, feedback)
             found = self._associator.follow(before, image, guess)
-            keep = found.good.copy()
-            keep[keep] = self._extractor.allows(found.points[keep])
-            self._stats.count(**found.lost, lost_mask=found.good & ~keep)
+            kept = np.flatnonzero(found.good)
+            allowed = self._extractor.allows(found.points.take(kept, axis=0))
+            kept = kept[allowed]
+            self._stats.count(**found.lost, lost_mask=~allowed)
         with self._stats.timed("ransac_ms"):
-            normalized = self._camera.undistort(found.points[keep].astype(np.float64))
-            after = Tracks.of(image, stamp_ns, before.ids[keep], found.points[keep], normalized)
+            points = found.points.take(kept, axis=0)
+            normalized = self._camera.undistort(points.astype(np.float64))
+            after = Tracks.of(image, stamp_ns, before.ids[kept], points, normalized)
             self._moving.next_frame()
             moves = self._moving.among(after.ids)
             tested = np.flatnonzero(~moves)
-            places = self._unrolled(before)[keep][tested], self._unrolled(after)[tested]
-            scale = self._tolerance_scale(before.pixels[keep], after.pixels)
+            starts = self._unrolled(before).take(kept[tested], axis=0)
+            places = starts, self._unrolled(after).take(tested, axis=0)
+            scale = self._tolerance_scale(before.pixels.take(kept, axis=0), after.pixels)
             motions = [tested[rows] for rows in self._rigid_motions(*places, scale)]
             self._motion_ids = [after.ids[rows] for rows in motions]
             inlier = moves.copy()
@@ -113,10 +117,11 @@ class CameraTracker:
                 self._stats.count(moving=self._moving.among(after.ids))
                 inlier[:] = True
             in_map = np.ones(len(after), np.bool_)
-            in_map[inlier] = self._fits_map(after.select(inlier), stamp_ns, feedback)
+            if self._config.map_check_px is not None:
+                in_map[inlier] = self._fits_map(after.select(inlier), stamp_ns, feedback)
             self._stats.count(rejected_ransac=~inlier, rejected_map=inlier & ~in_map)
-            self.outliers = after.select(~(inlier & in_map))
-            after = after.select(inlier & in_map)
+            inlier &= in_map
+            self.outliers, after = after.select(~inlier), after.select(inlier)
         with self._stats.timed("temporal_ms"):
             after = self._recovered(before, after)
         alone = apart(np.ascontiguousarray(after.pixels), _MERGE_DISTANCE_PX)
@@ -133,7 +138,7 @@ class CameraTracker:
         """
         here, there = after.common(before)
         moves = self._moving.among(after.ids)
-        self._extractor.count_apart(after.pixels[moves])
+        self._extractor.count_apart(after.pixels.compress(moves, axis=0))
         rest = ~moves[here]  # others would spoil the motion of these
         here, there = here[rest], there[rest]
         verify = self._config.verify_new and len(here) >= MIN_POINTS
@@ -146,7 +151,9 @@ class CameraTracker:
             good = np.ones(count, np.bool_)
             flow = np.full((count, 2), np.nan)
             if candidates.origins is not None:
-                motions = self._motions(before.select(there), after.select(here))
+                starts = self._unrolled(before).take(there, axis=0)
+                followed = self._unrolled(after).take(here, axis=0)
+                motions = self._motions(after.ids[here], starts, followed)
                 unrolled = self._predictor.unrolled
                 origins = unrolled(candidates.origins, origins, before.stamp_ns)
                 ends = unrolled(points, normalized, after.stamp_ns)
@@ -160,8 +167,8 @@ class CameraTracker:
             ids = np.arange(next_id, next_id + np.count_nonzero(good), dtype=np.int64)
             self._moving.suspect(ids[~fits[good]])
             self._associator.accept(ids, good)
-        new = Tracks.of(after.image, after.stamp_ns, ids, points[good], normalized[good])
-        new.residual_flow[:] = flow[good]
+        chosen = (values.compress(good, axis=0) for values in (points, normalized, flow))
+        new = Tracks(after.image, after.stamp_ns, ids, *chosen)
         found = self._with_corners_of_objects(after.joined(new), next_id + len(ids))
         if self._lost is not None:
             self._lost.remember(found)
@@ -218,9 +225,9 @@ class CameraTracker:
             return [everything]
 
         def inliers(rows: IntArray) -> BoolArray:
-            return self._inliers(before[rows], after[rows], scale)
+            return self._inliers(before.take(rows, axis=0), after.take(rows, axis=0), scale)
 
-        largest = inliers(everything)
+        largest = self._inliers(before, after, scale)
         return [
             everything[largest],
             *coherent_groups(inliers, everything[~largest], len(before)),
@@ -237,7 +244,7 @@ class CameraTracker:
         """Which candidates (M, 2) for new features fit a motion of the features, or a new one."""
         limit_px = scale * self._config.epipolar_px
         distances = [distances_px(self._camera, F, origins, points) for F in motions]
-        good: BoolArray = np.min(distances, axis=0) < limit_px
+        good: BoolArray = reduce(np.minimum, distances) < limit_px
 
         def inliers(rows: IntArray) -> BoolArray:
             return self._inliers(origins[rows], points[rows], scale)
@@ -246,12 +253,14 @@ class CameraTracker:
             good[group] = True
         return good
 
-    def _motions(self, before: Tracks, after: Tracks) -> list[FloatArray]:
-        """The fundamental matrix (3, 3) of each rigid motion of the features in both images."""
-        others = [np.isin(after.ids, ids) for ids in self._motion_ids[1:]]
-        groups = [~np.any([np.zeros(len(after), np.bool_), *others], axis=0), *others]
-        start, end = self._unrolled(before), self._unrolled(after)
-        matches = ((start[rows], end[rows]) for rows in groups)
+    def _motions(self, ids: IntArray, start: FloatArray, end: FloatArray) -> list[FloatArray]:
+        """The fundamental matrix (3, 3) of each rigid motion of features (N,) in both images."""
+        others = [are_among(ids, moved) for moved in self._motion_ids[1:]]
+        rest = np.ones(len(ids), np.bool_)
+        for other in others:
+            rest &= ~other
+        groups = (rest, *others)
+        matches = ((start.compress(rows, axis=0), end.compress(rows, axis=0)) for rows in groups)
         camera = self._camera
         enough = [(one, other) for one, other in matches if len(one) >= MIN_POINTS]
         return [fitted_motion(camera, *pair) for pair in enough or [(start, end)]]
@@ -259,8 +268,6 @@ class CameraTracker:
     def _fits_map(self, tracks: Tracks, stamp_ns: int, feedback: Feedback) -> BoolArray:
         """Which features (N,) fit the map of the back end, or are not in it."""
         fits = np.ones(len(tracks), np.bool_)
-        if self._config.map_check_px is None:
-            return fits
         world_T_body = self._predictor.body_pose(stamp_ns)
         # PnP weighs all of the plane z = 1 alike; its noise grows towards the edge of a wide lens
         near = np.all(np.abs(tracks.normalized) < MAX_TANGENT, axis=1)
@@ -293,7 +300,8 @@ class CameraTracker:
         """The same features with their residual flow since the image before."""
         here, there = after.common(before)
         seconds = (after.stamp_ns - before.stamp_ns) * 1e-9
+        start, end = self._unrolled(before), self._unrolled(after)
         after.residual_flow[here] = self._predictor.residual_flow(
-            self._unrolled(before)[there], self._unrolled(after)[here], seconds
+            start.take(there, axis=0), end.take(here, axis=0), seconds
         )
         return after

@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -172,21 +172,22 @@ class Tracks:
     def joined(self, other: Tracks) -> Tracks:
         """These features and others, in the order of their ids."""
         ids = np.concatenate([self.ids, other.ids])
-        order = np.argsort(ids, kind="stable")
-        return replace(
-            self,
-            ids=ids[order],
-            pixels=np.concatenate([self.pixels, other.pixels])[order],
-            normalized=np.concatenate([self.normalized, other.normalized])[order],
-            residual_flow=np.concatenate([self.residual_flow, other.residual_flow])[order],
+        both = Tracks(
+            self.image,
+            self.stamp_ns,
+            ids,
+            np.concatenate([self.pixels, other.pixels]),
+            np.concatenate([self.normalized, other.normalized]),
+            np.concatenate([self.residual_flow, other.residual_flow]),
         )
+        return both.select(ids.argsort(kind="stable"))
 
     def common(self, other: Tracks) -> tuple[IntArray, IntArray]:
         """Indices here and there (M,) of the features in both."""
         if len(other) == 0:
             return np.zeros(0, np.int64), np.zeros(0, np.int64)
-        there = np.minimum(np.searchsorted(other.ids, self.ids), len(other) - 1)
-        here = np.flatnonzero(other.ids[there] == self.ids)
+        there = other.ids.searchsorted(self.ids)
+        here = np.flatnonzero(other.ids.take(there, mode="clip") == self.ids)
         return here, there[here]
 
     def observations(self) -> FeatureObservations:

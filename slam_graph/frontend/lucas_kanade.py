@@ -211,13 +211,13 @@ class CornerTracking:
         guided = min(_GUIDED_LEVELS, self._levels)
         for levels, tried in ((guided, guess.trusted), (self._levels, None)):
             rows = np.flatnonzero(~good if tried is None else tried)
-            flow = self._lucas_kanade.flow(
-                before.image, image, before.pixels[rows], guess.points[rows], levels
-            )
+            if len(rows) == 0:
+                continue
+            start = before.pixels.take(rows, axis=0)
+            near = guess.points.take(rows, axis=0)
+            flow = self._lucas_kanade.flow(before.image, image, start, near, levels)
             points[rows], found[rows] = flow.points, flow.found
-            good[rows] = flow.found & (
-                flow.error_px < self._tolerance_px(before.pixels[rows], flow.points)
-            )
+            good[rows] = flow.found & (flow.error_px < self._tolerance_px(start, flow.points))
         if self._patches is not None and n > 0:
             points = self._patches.placed(before, image, points, good)
         return Association(points, good, {"lost_klt": ~found, "lost_fb": found & ~good})
@@ -234,11 +234,14 @@ class CornerTracking:
         found = self._extractor.extract(after.image, after.pixels, _SURPLUS)
         points = found.points
         here, there = after.common(before)
-        guess = points + neighbour_flow(after.pixels[here], before.pixels[there], points)
+        known = after.pixels.take(here, axis=0), before.pixels.take(there, axis=0)
+        guess = points + neighbour_flow(*known, points)
         flow = self._lucas_kanade.flow(after.image, before.image, points, guess, _GUIDED_LEVELS)
         limit_px = _VERIFICATION * self._tolerance_px(points, flow.points)
         good = found.within_quotas(flow.found & (flow.error_px < limit_px))
-        return Candidates(points[good], flow.points[good], _VERIFICATION)
+        chosen = np.flatnonzero(good)
+        origins = flow.points.take(chosen, axis=0)
+        return Candidates(points.take(chosen, axis=0), origins, _VERIFICATION)
 
     def _tolerance_px(self, start: Pixels, end: Pixels) -> Pixels | float:
         """Errors (N,) allowed to corners, forth and back."""

@@ -59,7 +59,8 @@ class MovingTracks:
 
     def suspect(self, ids: IntArray) -> None:
         """Features that are outliers in this frame."""
-        self.ids = np.union1d(self.ids, ids)
+        if len(ids):
+            self.ids = np.union1d(self.ids, ids)
 
     def add(self, ids: IntArray) -> None:
         """Features that move, by the back end or by where they are."""
