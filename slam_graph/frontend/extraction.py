@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 
 import cv2
@@ -30,14 +31,41 @@ _MARGIN_PX = 4
 """Cells are cut out with this margin, so that scores at their edge see the pixels beyond."""
 
 
-@dataclass(frozen=True)
+_Part = tuple[slice, slice]
+"""Rows and columns of an image."""
+
+
+@dataclass(frozen=True, eq=False)
 class _Cell:
-    """A cell of the grid: columns [left, right) and rows [top, bottom) of the image."""
+    """A cell of the grid: columns [left, right) and rows [top, bottom) of the image.
+
+    Attributes:
+        own: these, as a part of the image.
+        around: the same with a margin, as far as the image reaches.
+        inner: the cell, as a part of what is around it.
+        origin: (2,) the first pixel (u, v) of what is around it.
+    """
 
     left: int
     top: int
     right: int
     bottom: int
+    own: _Part
+    around: _Part
+    inner: _Part
+    origin: Pixels
+
+    @staticmethod
+    def of(columns: tuple[int, int], rows: tuple[int, int], shape: tuple[int, int]) -> _Cell:
+        """The cell of some columns and rows of an image of a shape (height, width)."""
+        (left, right), (top, bottom), (height, width) = columns, rows, shape
+        u, v = max(0, left - _MARGIN_PX), max(0, top - _MARGIN_PX)
+        last_u, last_v = min(width, right + _MARGIN_PX), min(height, bottom + _MARGIN_PX)
+        own = slice(top, bottom), slice(left, right)
+        around = slice(v, last_v), slice(u, last_u)
+        inner = slice(top - v, bottom - v), slice(left - u, right - u)
+        origin = np.array([u, v], np.float32)
+        return _Cell(left, top, right, bottom, own, around, inner, origin)
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,9 +119,9 @@ class FeatureExtractor:
         xs = np.linspace(0, width, columns + 1).astype(int)
         ys = np.linspace(0, height, rows + 1).astype(int)
         self._cells = [
-            _Cell(int(xs[i]), int(ys[j]), int(xs[i + 1]), int(ys[j + 1]))
-            for j in range(rows)
-            for i in range(columns)
+            _Cell.of(across, down, (height, width))
+            for down in pairwise(ys.tolist())
+            for across in pairwise(xs.tolist())
         ]
         self._edges = xs, ys
         allowed = np.zeros((height, width), np.uint8)
@@ -237,17 +265,14 @@ class FeatureExtractor:
 
     def _in_cell(self, image: Image, free: Image, cell: _Cell, count: int) -> Keypoints:
         """The best keypoints of a cell, best first."""
-        height, width = image.shape
-        left, top = max(0, cell.left - _MARGIN_PX), max(0, cell.top - _MARGIN_PX)
-        right, bottom = min(width, cell.right + _MARGIN_PX), min(height, cell.bottom + _MARGIN_PX)
-        inner = free[cell.top : cell.bottom, cell.left : cell.right]
-        if cv2.countNonZero(inner) == 0:
+        own = free[cell.own]
+        if cv2.countNonZero(own) == 0:
             return Keypoints.concatenate([])
-        allowed = np.zeros((bottom - top, right - left), np.uint8)
-        allowed[cell.top - top : cell.bottom - top, cell.left - left : cell.right - left] = inner
-        patch = np.ascontiguousarray(image[top:bottom, left:right])
+        patch = np.ascontiguousarray(image[cell.around])
+        allowed = np.zeros(patch.shape, np.uint8)
+        allowed[cell.inner] = own
         found = self._detector.detect(patch, allowed, count, self._distance_px)
-        return found.at(found.pixels + np.array([left, top], np.float32))
+        return found.at(found.pixels + cell.origin)
 
 
 def _disk(radius: int) -> IntArray:
