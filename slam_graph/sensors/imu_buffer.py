@@ -71,15 +71,30 @@ class ImuBuffer:
         if len(t) == 0:  # nothing known: the caller asks `largest_gap_s` first
             return ImuData(np.array([start_ns, end_ns]), np.zeros((2, 3)), np.zeros((2, 3)))
         inside = slice(int(t.searchsorted(start_ns, side="right")), int(t.searchsorted(end_ns)))
-        around = slice(max(inside.start - 1, 0), inside.stop + 1)
         stamps = np.concatenate([[start_ns], t[inside], [end_ns]])
-        seconds = (t[around] - start_ns) * 1e-9
-        at = (stamps - start_ns) * 1e-9
-        gyro, accel = np.empty((2, len(at), 3))
-        for result, values in ((gyro, self.data.gyro[around]), (accel, self.data.accel[around])):
-            for axis in range(3):
-                result[:, axis] = np.interp(at, seconds, values[:, axis])
+        gyro, accel = np.empty((2, len(stamps), 3))
+        gyro[1:-1], accel[1:-1] = self.data.gyro[inside], self.data.accel[inside]
+        gyro[0], accel[0] = self._at(start_ns, start_ns)
+        gyro[-1], accel[-1] = self._at(end_ns, start_ns)
         return ImuData(stamps, gyro, accel)
+
+    def _at(self, stamp_ns: int, zero_ns: int) -> tuple[FloatArray, FloatArray]:
+        """Angular rate and specific force (3,) at a time, interpolated or the nearest held.
+
+        Args:
+            stamp_ns: the time.
+            zero_ns: what times in seconds are counted from.
+        """
+        samples = self.data
+        after = int(samples.stamps_ns.searchsorted(stamp_ns, side="right"))
+        if after == 0 or after == len(samples):
+            held = max(after - 1, 0)
+            return samples.gyro[held], samples.accel[held]
+        stamps = samples.stamps_ns[after - 1 : after + 1].tolist()
+        start_s, end_s, at_s = ((t - zero_ns) * 1e-9 for t in (*stamps, stamp_ns))
+        found = (values[after - 1 : after + 1] for values in (samples.gyro, samples.accel))
+        gyro, accel = ((b - a) / (end_s - start_s) * (at_s - start_s) + a for a, b in found)
+        return gyro, accel
 
     def trend(self, stamp_ns: int, around_ns: int) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Angular rate, its derivative, and specific force at a time, by lines fitted around it.
