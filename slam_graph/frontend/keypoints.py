@@ -159,7 +159,7 @@ class Tracks:
     def select(self, keep: BoolArray | IntArray) -> Tracks:
         """Those where a mask `keep` (N,) is true, or those with given indices."""
         # `take` needs a third of the time of an index that is a mask
-        rows = np.flatnonzero(keep) if keep.dtype == np.bool_ else keep
+        rows = keep.nonzero()[0] if keep.dtype == np.bool_ else keep
         return Tracks(
             self.image,
             self.stamp_ns,
@@ -187,7 +187,7 @@ class Tracks:
         if len(other) == 0:
             return np.zeros(0, np.int64), np.zeros(0, np.int64)
         there = other.ids.searchsorted(self.ids)
-        here = np.flatnonzero(other.ids.take(there, mode="clip") == self.ids)
+        here = (other.ids.take(there, mode="clip") == self.ids).nonzero()[0]
         return here, there[here]
 
     def observations(self) -> FeatureObservations:
