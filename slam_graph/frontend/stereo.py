@@ -25,6 +25,7 @@ from slam_graph.frontend.frontend_config import FrontendConfig
 from slam_graph.frontend.keypoints import Image, Pixels, Tracks
 from slam_graph.frontend.lucas_kanade import LucasKanade
 from slam_graph.frontend.outliers import epipolar_distance, essential_matrix, triangulated_depths
+from slam_graph.kernels.ascending import are_among
 from slam_graph.kernels.patch_search import most_similar
 from slam_graph.sensors import Camera, Rig, RigCamera
 
@@ -244,16 +245,18 @@ class StereoMatcher:
         if reference_image is None or len(reference) == 0:
             return Tracks.empty(image, stamp_ns)
         worthwhile, guess = self._guess(reference, reference_image, image, first_new_id)
-        reference, guess = reference.select(worthwhile), guess[worthwhile]
+        reference, guess = reference.select(worthwhile), guess.compress(worthwhile, axis=0)
         flow = self._lucas_kanade.flow(reference_image, image, reference.pixels, guess, LEVELS)
         keep = flow.found & (flow.error_px < self._config.forward_backward_px)
-        keep[keep] = self._extractor.allows(flow.points[keep])
-        reference, pixels = reference.select(keep), flow.points[keep]
+        keep[keep] = self._extractor.allows(flow.points.compress(keep, axis=0))
+        reference, pixels = reference.select(keep), flow.points.compress(keep, axis=0)
         normalized = self._camera.undistort(pixels.astype(np.float64))
         good = self._inliers(reference.normalized, normalized)
-        self.counts = _MatchCounts(int(np.sum(good)), int(np.sum(~good)))
+        matched = int(np.count_nonzero(good))
+        self.counts = _MatchCounts(matched, len(good) - matched)
         matches = Tracks.of(image, stamp_ns, reference.ids, pixels, normalized).select(good)
-        self._ids, self._offsets = matches.ids, matches.pixels - reference.pixels[good]
+        self._ids = matches.ids
+        self._offsets = matches.pixels - reference.pixels.compress(good, axis=0)
         return matches
 
     def _guess(
@@ -261,16 +264,17 @@ class StereoMatcher:
     ) -> tuple[BoolArray, Pixels]:
         """Which features (N,) to look for, and where to start (N, 2)."""
         guess = reference.pixels.copy()
-        known = np.isin(reference.ids, self._ids)
-        guess[known] += self._offsets[np.searchsorted(self._ids, reference.ids[known])]
+        known = are_among(reference.ids, self._ids)
+        at = self._ids.searchsorted(reference.ids[known])
+        guess[known] += self._offsets.take(at, axis=0)
         due = (reference.ids + self._frames) % RETRY_FRAMES == 0
         seek = ~known & (due | (reference.ids >= first_new_id))
         if seek.any():
             points, score = self._search.search(
                 _reduce(reference_image),
                 _reduce(image),
-                reference.pixels[seek],
-                reference.normalized[seek],
+                reference.pixels.compress(seek, axis=0),
+                reference.normalized.compress(seek, axis=0),
             )
             guess[seek] = points
             seek[seek] = score > MIN_SCORE
