@@ -18,6 +18,7 @@ import numpy as np
 
 from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.backend.cost.feature_tracks import Observations, is_in
+from slam_graph.backend.objects.track_assignment import MARGIN
 from slam_graph.backend.objects.track_window import TrackWindow, squared_errors
 
 _ROUNDS = 3
@@ -43,6 +44,9 @@ class MirrorMotion:
     def worse(self, members: IntArray, poses: dict[int, gtsam.Pose3]) -> float:
         """Squared errors over σ² of the mirror image less those of the motion.
 
+        Where that is clear already, the motion is taken as it is: fitted to the tracks once more,
+        as the mirror image is, it would be better still.
+
         Args:
             members: (N,) ids of the tracks of an object, ascending.
             poses: of the platform in its frame, object_T_body, by the stamps of frames.
@@ -55,6 +59,8 @@ class MirrorMotion:
             return 0.0
         mirrored = _mirrored(cameras, fit.points)
         best = self._refined(tracks, mirrored, self._fit(tracks, mirrored))
+        if best - fit.squares > MARGIN:
+            return best - fit.squares
         return best - self._refined(tracks, cameras, fit)
 
     def _refined(self, tracks: _Tracks, cameras: list[gtsam.Pose3], fit: _Fit) -> float:

@@ -67,12 +67,13 @@ class TrackAssignment:
         others = squares.copy()
         others[best, rows] = np.inf
         clear = _clearly(least, others.min(axis=0))
-        alone = self._as_static(ids)
         is_free, before = np.isin(ids, free), _of_own(objects, ids, squares)
+        # masks tell what is of the object, and not static
+        alone = None if self._labels.given else self._as_static(ids, clear & is_free)
         for k, item in enumerate(objects):
             mine = clear & (best == k)
             new = mine & is_free
-            if not self._labels.given:  # masks tell what is of the object, and not static
+            if alone is not None:
                 new &= _clearly(least, alone, self._scale(item))
             over = mine & ~is_free & ~np.isin(ids, item.members) & _clearly(least, before)
             for other in objects:
@@ -90,7 +91,8 @@ class TrackAssignment:
         leaving = np.union1d(fit[unfit], self._labels.contradicted(item.members, item.label))
         if not item.moving:
             return leaving
-        fit, squares = fit[~unfit], squares[~unfit]
+        rest = ~unfit & (squares > MARGIN)  # no other can be static: errors are not negative
+        fit, squares = fit[rest], squares[rest]
         frames = {stamp: pose for stamp, pose in self._static.items() if stamp in item.poses}
         same, alone, dof = self._window.misfit(fit, frames, self._sigma_px)
         alone, freedom = _for(fit, same, alone), _for(fit, same, dof)
@@ -120,9 +122,9 @@ class TrackAssignment:
         limit = self._scale(item) * chdtri(dof, _FITS)
         return _for(ids, fit, np.where(errors < limit, errors, np.inf))
 
-    def _as_static(self, ids: IntArray) -> FloatArray:
-        """Squared errors (N,) of tracks as static points."""
-        fit, errors, _ = self._window.misfit(ids, self._static, self._sigma_px)
+    def _as_static(self, ids: IntArray, wanted: BoolArray) -> FloatArray:
+        """Squared errors (N,) of tracks as static points; infinite where they are not wanted."""
+        fit, errors, _ = self._window.misfit(ids[wanted], self._static, self._sigma_px)
         return _for(ids, fit, errors)
 
     def _scale(self, item: TrackedObject) -> float:

@@ -72,7 +72,7 @@ def minimize(
         numpy.linalg.LinAlgError: if the cost leaves a variable undetermined.
     """
     if policy.damping == "levenberg_marquardt":
-        return _levenberg_marquardt(cost, policy, linear)
+        return _levenberg_marquardt(cost, policy, linear, predicted)
     linear = linear or cost.linearize(summed=True)
     layout, before = cost.layout(), cost.value(linear, predicted)
     posterior, delta, promised = _step(cost, linear, layout, predicted)
@@ -151,10 +151,13 @@ def _system(
 
 
 def _levenberg_marquardt(
-    cost: Cost, policy: GaussNewtonPolicy, linear: Linearization | None
+    cost: Cost,
+    policy: GaussNewtonPolicy,
+    linear: Linearization | None,
+    predicted: SquareRootInformation | None,
 ) -> Minimum:
     """Gauss-Newton steps, with damping from the first one on that does not lower the cost."""
-    problem = _DampedCost(cost, linear)
+    problem = _DampedCost(cost, linear, predicted)
 
     def converged(attempt: Attempt) -> bool:
         if not attempt.accepted:
@@ -171,8 +174,11 @@ def _levenberg_marquardt(
 class _DampedCost:
     """A cost as `levenberg_marquardt` takes it (see `DampedProblem`)."""
 
-    def __init__(self, cost: Cost, linear: Linearization | None) -> None:
+    def __init__(
+        self, cost: Cost, linear: Linearization | None, predicted: SquareRootInformation | None
+    ) -> None:
         self._cost, self._layout, self._given = cost, cost.layout(), linear
+        self._predicted = predicted
         self._delta: FloatArray | None = None
 
     def value(self) -> float:
@@ -182,8 +188,8 @@ class _DampedCost:
     def linearize(self) -> None:
         """Linearise all residuals."""
         self._linear = self._given or self._cost.linearize(summed=True)
-        self._given, self._delta = None, None
-        self._system = _system(self._cost, self._linear, self._layout)
+        self._system = _system(self._cost, self._linear, self._layout, self._predicted)
+        self._given, self._predicted, self._delta = None, None, None
 
     def solve(self, damping: float) -> float:
         """Solve the damped system; the decrease that the undamped one predicts."""
