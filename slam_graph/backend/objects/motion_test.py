@@ -22,13 +22,14 @@ from enum import IntEnum
 import numpy as np
 from scipy.special import chdtri
 
-from slam_graph.arrays import FloatArray, IntArray
+from slam_graph.arrays import BoolArray, FloatArray, IntArray
 from slam_graph.backend.backend_config import BackendConfig
 from slam_graph.backend.cost.feature_tracks import Observations
 from slam_graph.backend.cost.reprojection import Geometry, RigProjection
 from slam_graph.backend.cost.triangulation import triangulate
 from slam_graph.backend.objects.ego_motion import EgoMotion
 from slam_graph.backend.objects.objects_config import ObjectsConfig
+from slam_graph.backend.objects.track_window import largest_squares
 from slam_graph.kernels.track_motion import motion_steps
 
 _STEPS = 4
@@ -96,6 +97,11 @@ class MotionTest:
         ids = np.zeros(0, np.int64)
         return MotionTest(ids, vectors, vectors, np.zeros((0, 3, 3)), none, none, ids, none)
 
+    @property
+    def moves(self) -> BoolArray:
+        """(J,) which tracks are not those of static points, as far as can be told."""
+        return self.verdicts >= Verdict.MOVING
+
     def of(self, verdict: Verdict) -> IntArray:
         """Ids (N,) of the tracks with a verdict, ascending."""
         return np.asarray(self.ids[self.verdicts == verdict])
@@ -147,7 +153,7 @@ def judge_tracks(
     speed = np.linalg.norm(velocities, axis=1)
     verdicts[~moving & (speed + 2.0 * largest < config.min_speed)] = Verdict.STATIC
     verdicts[moving] = Verdict.MOVING
-    verdicts[squares > chdtri(dof, _MISFIT)] = Verdict.WRONG
+    verdicts[squares > largest_squares(dof, _MISFIT)] = Verdict.WRONG
     return MotionTest(
         obs.ids,
         points,

@@ -21,6 +21,7 @@ from scipy.special import chdtri
 
 from slam_graph.arrays import BoolArray, FloatArray, IntArray
 from slam_graph.backend.backend_config import BackendConfig
+from slam_graph.backend.cost.feature_tracks import is_in
 from slam_graph.backend.objects.ego_motion import EgoMotion
 from slam_graph.backend.objects.objects_config import ObjectsConfig
 from slam_graph.backend.objects.relative_motion import RelativeMotion, motion_over
@@ -144,7 +145,7 @@ class ObjectReview:
         """(N,) squared errors of tracks over σ²; 0 for those that are too short."""
         fit, squares, _ = self._window.misfit(members, poses, self._sigma_px)
         result = np.zeros(len(members))
-        result[np.isin(members, fit)] = squares
+        result[is_in(members, fit)] = squares
         return result
 
     def _total(

@@ -14,6 +14,7 @@ import numpy as np
 
 from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.backend.backend_config import BackendConfig
+from slam_graph.backend.cost.feature_tracks import ascending_union, is_in
 from slam_graph.backend.objects.ego_motion import EgoMotion
 from slam_graph.backend.objects.mirror_motion import MirrorMotion
 from slam_graph.backend.objects.motion_segmentation import rigid_groups
@@ -107,7 +108,7 @@ class ObjectTracker:
         self._labels = TrackLabels(frame)
         states = self._follow(ego, noise_px)
         own = members_of(self.objects)
-        others = np.setdiff1d(self._window.seen, own, assume_unique=True)
+        others = _without(self._window.seen, own)
         test = self._tested(others, ego, sigma_px)
         sigma_px *= self._noise_of(test)
         assignment = TrackAssignment(self._window, self._labels, ego, sigma_px)
@@ -153,7 +154,7 @@ class ObjectTracker:
             if item.confirmed and len(apart) > _TWO_MOTIONS * len(item.members):
                 self._separate(item, ego, sigma_px)
             else:
-                item.members = np.setdiff1d(item.members, np.union1d(leaving, apart))
+                item.members = _without(item.members, ascending_union(leaving, apart))
 
     def _moving_within(self, item: TrackedObject, ego: EgoMotion, sigma_px: float) -> IntArray:
         """Ids (N,) of the tracks of an object that move in its frame: an object is a world."""
@@ -164,7 +165,7 @@ class ObjectTracker:
         obs = self._window.observations(item.members, _LEAST_FRAMES, stamps)
         rig, backend = self._window.projection, self._policies[1]
         test = judge_tracks(obs, rig, world, sigma_px, backend, self._config)
-        return test.ids[np.isin(test.verdicts, (Verdict.MOVING, Verdict.WRONG))]
+        return test.ids[test.moves]
 
     def _separate(self, item: TrackedObject, ego: EgoMotion, sigma_px: float) -> None:
         """Leave an object the largest part of its tracks that moves as one; none fits it."""
@@ -220,13 +221,13 @@ class ObjectTracker:
                 if older.label != younger.label or older.number >= younger.number:
                     continue
                 if older.moves_with(younger, ego):
-                    older.members = np.union1d(older.members, younger.members)
+                    older.members = ascending_union(older.members, younger.members)
                     self.objects.remove(younger)
                     break
 
     def _noise_of(self, test: MotionTest) -> float:
         """Noise of the tracks that do not move, over what is assumed; at most 1."""
-        steady = test.misfits[np.isin(test.verdicts, (Verdict.STATIC, Verdict.UNKNOWN))]
+        steady = test.misfits[~test.moves]
         if len(steady) >= _ENOUGH:
             ratio = float(np.clip(np.median(steady), _LEAST_NOISE**2, 1.0))
             self._noise_frames += 1
@@ -263,8 +264,8 @@ class ObjectTracker:
 
     def _new_groups(self, test: MotionTest, sigma_px: float) -> list[tuple[int, IntArray]]:
         """Labels and tracks of what begins to move; without masks labels are 0."""
-        free = ~np.isin(test.ids, members_of(self.objects))
-        moves = free & np.isin(test.verdicts, (Verdict.MOVING, Verdict.WRONG))
+        free = ~is_in(test.ids, members_of(self.objects))
+        moves = free & test.moves
         if not self._labels.given:
             return [(0, group) for group in self._groups(test.ids[moves], sigma_px)]
         taken = {item.label for item in self.objects}
@@ -311,23 +312,28 @@ class ObjectTracker:
         members = {int(i): item.number for item in self.objects for i in item.members}
         own = members_of(self.objects)
         standing = members_of([item for item in self.objects if item.standing])
-        free = ~np.isin(test.ids, own)
+        free = ~is_in(test.ids, own)
         ids = np.concatenate([test.ids[free], own])
         known = np.concatenate(
             [
                 test.probabilities[free],
-                np.isin(own, members_of(moving)).astype(np.float64),
+                is_in(own, members_of(moving)).astype(np.float64),
             ]
         )
         order = np.argsort(ids)
-        by_itself = test.ids[free & np.isin(test.verdicts, (Verdict.MOVING, Verdict.WRONG))]
+        by_itself = test.ids[free & test.moves]
         return ObjectFrame(
             states,
-            np.setdiff1d(np.union1d(own, by_itself), standing),
-            np.union1d(np.setdiff1d(test.of(Verdict.STATIC), own), standing),
-            np.setdiff1d(test.of(Verdict.WRONG), own),
+            _without(ascending_union(own, by_itself), standing),
+            ascending_union(_without(test.of(Verdict.STATIC), own), standing),
+            _without(test.of(Verdict.WRONG), own),
             (ids[order], known[order]),
             members,
             {item.number: item.world_points() for item in self.objects if item.confirmed},
             self._hulls(by_itself),
         )
+
+
+def _without(ids: IntArray, others: IntArray) -> IntArray:
+    """The ids (N,) that are not among others; both ascending."""
+    return ids[~is_in(ids, others)]

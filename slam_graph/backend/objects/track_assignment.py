@@ -12,13 +12,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.special import chdtri
 
 from slam_graph.arrays import BoolArray, FloatArray, IntArray
+from slam_graph.backend.cost.feature_tracks import ascending_union, is_in
 from slam_graph.backend.objects.ego_motion import EgoMotion
 from slam_graph.backend.objects.motion_test import MotionTest, Verdict
 from slam_graph.backend.objects.track_labels import TrackLabels
-from slam_graph.backend.objects.track_window import TrackWindow
+from slam_graph.backend.objects.track_window import TrackWindow, largest_squares
 from slam_graph.backend.objects.tracked_object import TrackedObject
 
 MARGIN = 12.0
@@ -57,8 +57,8 @@ class TrackAssignment:
         if not objects:
             return
         own = members_of(objects)
-        free = np.setdiff1d(test.ids[test.verdicts != Verdict.STATIC], own)
-        ids = np.union1d(free, own)
+        free = test.ids[(test.verdicts != Verdict.STATIC) & ~is_in(test.ids, own)]
+        ids = ascending_union(free, own)
         for item in objects:
             self._found[item.number] = self._window.misfit(ids, item.poses, self._sigma_px)
         squares = np.stack([self._squares(item, ids) for item in objects])
@@ -67,7 +67,7 @@ class TrackAssignment:
         others = squares.copy()
         others[best, rows] = np.inf
         clear = _clearly(least, others.min(axis=0))
-        is_free, before = np.isin(ids, free), _of_own(objects, ids, squares)
+        is_free, before = is_in(ids, free), _of_own(objects, ids, squares)
         # masks tell what is of the object, and not static
         alone = None if self._labels.given else self._as_static(ids, clear & is_free)
         for k, item in enumerate(objects):
@@ -75,10 +75,10 @@ class TrackAssignment:
             new = mine & is_free
             if alone is not None:
                 new &= _clearly(least, alone, self._scale(item))
-            over = mine & ~is_free & ~np.isin(ids, item.members) & _clearly(least, before)
+            over = mine & ~is_free & ~is_in(ids, item.members) & _clearly(least, before)
             for other in objects:
-                other.members = np.setdiff1d(other.members, ids[over])
-            item.members = np.union1d(item.members, ids[new | over])
+                other.members = other.members[~is_in(other.members, ids[over])]
+            item.members = ascending_union(item.members, ids[new | over])
 
     def leaving(self, item: TrackedObject) -> IntArray:
         """Ids (N,) of the tracks that are not of an object any more.
@@ -87,17 +87,17 @@ class TrackAssignment:
         be called first: it finds how well tracks fit.
         """
         fit, squares, dof = self._misfit(item, item.members)
-        unfit = squares > _CLEARLY * _scale(squares, dof) * chdtri(dof, _FITS)
-        leaving = np.union1d(fit[unfit], self._labels.contradicted(item.members, item.label))
+        unfit = squares > _CLEARLY * _scale(squares, dof) * largest_squares(dof, _FITS)
+        leaving = ascending_union(fit[unfit], self._labels.contradicted(item.members, item.label))
         if not item.moving:
             return leaving
         rest = ~unfit & (squares > MARGIN)  # no other can be static: errors are not negative
         fit, squares = fit[rest], squares[rest]
         frames = {stamp: pose for stamp, pose in self._static.items() if stamp in item.poses}
         same, alone, dof = self._window.misfit(fit, frames, self._sigma_px)
-        alone, freedom = _for(fit, same, alone), _for(fit, same, dof)
-        static = (squares - alone > MARGIN) & (alone < chdtri(freedom, _FITS))
-        return np.union1d(leaving, fit[static])
+        alone, limit = _for(fit, same, alone), _for(fit, same, largest_squares(dof, _FITS))
+        static = (squares - alone > MARGIN) & (alone < limit)
+        return ascending_union(leaving, fit[static])
 
     def _misfit(self, item: TrackedObject, ids: IntArray) -> tuple[IntArray, FloatArray, IntArray]:
         """How well tracks fit the motion of an object, as `join` has found.
@@ -110,7 +110,7 @@ class TrackAssignment:
             As `TrackWindow.misfit`.
         """
         found, squares, dof = self._found[item.number]
-        rows = np.isin(found, ids, assume_unique=True)
+        rows = is_in(found, ids)
         return found[rows], squares[rows], dof[rows]
 
     def _squares(self, item: TrackedObject, ids: IntArray) -> FloatArray:
@@ -119,7 +119,7 @@ class TrackAssignment:
         They are infinite where a track does not fit, or is not of its mask.
         """
         fit, errors, dof = self._misfit(item, self._labels.allowed(ids, item.label))
-        limit = self._scale(item) * chdtri(dof, _FITS)
+        limit = self._scale(item) * largest_squares(dof, _FITS)
         return _for(ids, fit, np.where(errors < limit, errors, np.inf))
 
     def _as_static(self, ids: IntArray, wanted: BoolArray) -> FloatArray:
@@ -138,15 +138,14 @@ class TrackAssignment:
 
 def members_of(objects: Sequence[TrackedObject]) -> IntArray:
     """Ids (N,) of the tracks of objects, ascending."""
-    none = np.zeros(0, np.int64)
-    return np.unique(np.concatenate([none, *(item.members for item in objects)]))
+    return ascending_union(*(item.members for item in objects))
 
 
 def _of_own(objects: Sequence[TrackedObject], ids: IntArray, squares: FloatArray) -> FloatArray:
     """Squared errors (N,) of tracks under the motion of the object that they are of."""
     own = np.full(len(ids), np.inf)
     for row, item in zip(squares, objects, strict=True):
-        mine = np.isin(ids, item.members)
+        mine = is_in(ids, item.members)
         own[mine] = row[mine]
     return own
 
@@ -167,5 +166,5 @@ def _scale(squares: FloatArray, dof: IntArray) -> float:
 def _for(ids: IntArray, found: IntArray, values: FloatArray | IntArray) -> FloatArray:
     """Values (N,) for ids (N,) where some were found (both ascending); infinite for the others."""
     result = np.full(len(ids), np.inf)
-    result[np.isin(ids, found)] = values
+    result[is_in(ids, found)] = values
     return result

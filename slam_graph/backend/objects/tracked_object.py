@@ -12,6 +12,7 @@ import numpy as np
 from scipy.special import chdtri
 
 from slam_graph.arrays import FloatArray, IntArray
+from slam_graph.backend.cost.feature_tracks import is_in
 from slam_graph.backend.objects.ego_motion import EgoMotion
 from slam_graph.backend.objects.object_state import ObjectMotion, ObjectState
 from slam_graph.backend.objects.objects_config import ObjectsConfig
@@ -149,7 +150,7 @@ class TrackedObject:
             The state then; None if too few of its tracks are seen.
         """
         frame = window.frames[-1]
-        self.members = self.members[np.isin(self.members, window.seen)]
+        self.members = self.members[is_in(self.members, window.seen)]
         if len(self.members) < 4:
             return None
         if frame.stamp_ns not in self._motion.poses and not self._motion.add(
@@ -167,7 +168,7 @@ class TrackedObject:
         while len(self._rejections) > max(len(self._motion.poses), 1):
             self._rejections.popleft()
         ids, counts = np.unique(np.concatenate(self._rejections), return_counts=True)
-        self.members = np.setdiff1d(self.members, ids[counts >= _MAX_REJECTIONS])
+        self.members = self.members[~is_in(self.members, ids[counts >= _MAX_REJECTIONS])]
 
     def _state(self, ego: EgoMotion) -> ObjectState | None:
         now = ego.stamps_ns[-1]
