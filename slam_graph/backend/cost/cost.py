@@ -350,7 +350,10 @@ class Cost:
         landmarks = np.zeros(0, np.bool_)
         tracks = np.zeros(0, np.bool_)
         innovations, confidence = Innovations(), confidence or self.config.gating.confidence
-        columns, of_poses = self._gated_columns(linear, predicted.layout)
+        obs = None if self.tracks is None or linear.tracks is None else self.tracks.obs
+        if obs is not None and tested is not None:  # they are new: few poses have seen them
+            obs, tracks = obs.subset(tested).without_idle_frames(), np.zeros(len(tested), np.bool_)
+        columns, of_poses = self._gated_columns(linear, predicted.layout, obs)
         first = min(int(part.min(initial=predicted.layout.size)) for part in (columns, of_poses))
         if first == predicted.layout.size:  # no observations
             return Gate(landmarks, tracks, innovations)
@@ -363,11 +366,11 @@ class Cost:
             near = linear.landmarks.depths < self.config.triangulation.min_depth_m
             landmarks = (distance < largest) & ~near & admitted[0]
             innovations += Innovations.of(distance, dof, largest, landmarks)
-        if linear.tracks is not None and self.tracks is not None:
-            assert not isinstance(linear.tracks, SummedFeatures), "these are not told apart"
-            obs, observations = self.tracks.obs, linear.tracks
+        if obs is not None and len(obs) and self.tracks is not None:
+            assert isinstance(linear.tracks, WhitenedObservations), "these are not told apart"
+            observations = linear.tracks
             if tested is not None:
-                obs, observations = obs.subset(tested), observations.subset(tested[obs.feature])
+                observations = observations.subset(tested[self.tracks.obs.feature])
             above = int(of_poses.min()) - first  # rows that are zero there: the root is triangular
             root_of_poses = root[above:, of_poses - first]
             covariance = root_of_poses.T @ root_of_poses
@@ -380,14 +383,14 @@ class Cost:
         return Gate(landmarks, tracks, innovations)
 
     def _gated_columns(
-        self, linear: Linearization, layout: Layout
+        self, linear: Linearization, layout: Layout, obs: Observations | None
     ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-        """Columns of observations of features of the state (N, 9 + C), and of those of tracks."""
+        """Columns of observations of features of the state (N, 9 + C), and of poses of tracks."""
         columns, of_poses = np.zeros((0, 9), np.intp), np.zeros(0, np.intp)
         if linear.landmarks is not None and self.landmarks is not None:
             columns = columns_of_state(self.landmarks, layout, self.rig.common_keys)
-        if linear.tracks is not None and self.tracks is not None:
-            of_poses = layout.indices(self.rig.keys_of(self.tracks.obs))
+        if obs is not None and len(obs):
+            of_poses = layout.indices(self.rig.keys_of(obs))
         return columns, of_poses
 
 

@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from enum import IntEnum
+from functools import cached_property
 
 import numpy as np
 from scipy.special import chdtri
@@ -76,7 +77,6 @@ class MotionTest:
         velocities: (J, 3) m/s.
         covariances: (J, 3, 3) of the velocities, with the errors of the poses.
         statistics: (J,) uᵀ Σ⁻¹ u.
-        probabilities: (J,) that it moves.
         verdicts: (J,) each a `Verdict`.
         misfits: (J,) squared errors under a constant velocity, over what is expected.
     """
@@ -86,7 +86,6 @@ class MotionTest:
     velocities: FloatArray
     covariances: FloatArray
     statistics: FloatArray
-    probabilities: FloatArray
     verdicts: IntArray
     misfits: FloatArray
 
@@ -95,7 +94,12 @@ class MotionTest:
         """Of no tracks."""
         none, vectors = np.zeros(0), np.zeros((0, 3))
         ids = np.zeros(0, np.int64)
-        return MotionTest(ids, vectors, vectors, np.zeros((0, 3, 3)), none, none, ids, none)
+        return MotionTest(ids, vectors, vectors, np.zeros((0, 3, 3)), none, ids, none)
+
+    @cached_property
+    def probabilities(self) -> FloatArray:
+        """(J,) that each moves; not every test is asked for them."""
+        return _probabilities(self.velocities, self.covariances)
 
     @property
     def moves(self) -> BoolArray:
@@ -160,7 +164,6 @@ def judge_tracks(
         velocities,
         Sigma,
         statistics,
-        _probabilities(velocities, Sigma),
         verdicts,
         squares / dof,
     )
