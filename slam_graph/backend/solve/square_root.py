@@ -40,6 +40,7 @@ class Layout:
     def __init__(self, dims: Mapping[int, int]) -> None:
         self.dims = dict(dims)
         self.size = sum(self.dims.values())
+        self._indices: dict[tuple[int, ...], NDArray[np.intp]] = {}
 
     @cached_property
     def starts(self) -> dict[int, int]:
@@ -59,8 +60,14 @@ class Layout:
         return Layout({**self.dims, **dims})
 
     def indices(self, keys: Iterable[int]) -> NDArray[np.intp]:
-        """Column numbers of the keys, in the order given."""
-        chosen = list(keys)
+        """Column numbers of the keys, in the order given; not to be changed."""
+        chosen = tuple(keys)
+        known = self._indices.get(chosen)  # every step asks for the same ones several times
+        if known is None:
+            known = self._indices[chosen] = self._columns_of(chosen)
+        return known
+
+    def _columns_of(self, chosen: tuple[int, ...]) -> NDArray[np.intp]:
         if not chosen:
             return np.zeros(0, np.intp)
         starts = np.array([self.starts[k] for k in chosen], np.intp)
