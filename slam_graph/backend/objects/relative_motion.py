@@ -14,7 +14,6 @@ In the hybrid formulation of Bârsan et al. and DynoSAM the same observation is 
 
 from __future__ import annotations
 
-from contextlib import suppress
 from dataclasses import dataclass
 
 import gtsam
@@ -165,11 +164,11 @@ class RelativeMotion:
         if not {now_ns, before_ns} <= self.poses.keys():
             return None
         keys = [X(self._frames[before_ns]), X(self._frames[now_ns])]
-        own = self.covariance(now_ns)
-        covariance = np.zeros((12, 12))
-        covariance[:6, :6] = covariance[6:, 6:] = own
-        with suppress(EstimationError):  # of an algorithm without past poses: as if independent
+        try:
             covariance = self._estimator.covariance_of(keys)
+        except EstimationError:  # of an algorithm without past poses: as if independent
+            covariance = np.zeros((12, 12))
+            covariance[:6, :6] = covariance[6:, 6:] = self.covariance(now_ns)
         return RelativeStep(
             before_ns, now_ns, self.poses[before_ns], self.poses[now_ns], covariance
         )
