@@ -178,7 +178,9 @@ class _DampedCost:
         self, cost: Cost, linear: Linearization | None, predicted: SquareRootInformation | None
     ) -> None:
         self._cost, self._layout, self._given = cost, cost.layout(), linear
-        self._predicted = predicted
+        # with new variables among its columns the QR would round otherwise
+        known = predicted is not None and predicted.layout is self._layout
+        self._predicted = predicted if known else None
         self._delta: FloatArray | None = None
 
     def value(self) -> float:
