@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,10 +18,8 @@ KEPT_NS = 24_000_000_000
 """So much of the recording is looked at: what came after the start, as far as it goes."""
 _PAIRS, _PAIRS_APART_NS = 4, 1_500_000_000
 """Images of two cameras that are kept, and the time between them."""
-_LEAST_USED, _LEAST_LEFT = 0.4, 0.6
-"""Where the first part of the observations is of features that the estimator used and the gate did
-not reject, the others are left out. Else those that were rejected are, where the second part is
-left."""
+_LEAST_LEFT = 0.6
+"""Features that the gate rejects are left out where this part of the observations is left."""
 
 
 def _count(frames: list[FeatureFrame]) -> int:
@@ -31,49 +28,20 @@ def _count(frames: list[FeatureFrame]) -> int:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Known:
-    """What came with some frames.
-
-    Attributes:
-        imu: samples up to the last of them.
-        rejected: ids (N,) of the features that move by themselves, or were rejected by the gate.
-        used: ids (M,) of the features whose positions were estimated.
-    """
-
-    imu: ImuData
-    rejected: IntArray
-    used: IntArray
-
-    @staticmethod
-    def of(frame: EstimatedFrame) -> _Known:
-        """What came with one frame."""
-        rejected = np.concatenate([frame.rejected, frame.dynamic])
-        return _Known(frame.imu, rejected, frame.landmark_ids)
-
-    @staticmethod
-    def of_all(known: Iterable[_Known]) -> _Known:
-        """What came with several frames, in their order."""
-        parts = list(known)
-        return _Known(
-            ImuData.concatenate([part.imu for part in parts]),
-            np.unique(np.concatenate([part.rejected for part in parts])),
-            np.unique(np.concatenate([part.used for part in parts])),
-        )
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class _Kept:
     """A frame that is kept.
 
     Attributes:
         features: what was found in it.
-        known: what came with it, and with the frames since the one before.
+        imu: the samples since the one before.
+        rejected: ids (N,) of the features that were rejected by the gate since then.
         judged: whether it was known what moves by itself: there was a state, or no objects are
             estimated.
     """
 
     features: FeatureFrame
-    known: _Known
+    imu: ImuData
+    rejected: IntArray
     judged: bool
 
 
@@ -89,7 +57,7 @@ class KeptFrames:
         """
         self._objects = objects
         self._frames: deque[_Kept] = deque()
-        self._since: list[_Known] = []
+        self._since: list[tuple[ImuData, IntArray]] = []
         self._pairs: deque[CameraFrame] | None = deque(maxlen=_PAIRS) if pairs else None
 
     def __len__(self) -> int:
@@ -100,26 +68,23 @@ class KeptFrames:
         """Features of the frames that are kept, without those that move by themselves.
 
         Such are those of moving objects, and what the gate has rejected: a board before the camera
-        would look like another mounting or focal length. Features that were never used are left out
-        as well: on the board some are too new to be rejected. Where most observations are theirs,
-        the estimate is wrong and not they. Where moving objects are estimated, frames before there
-        is a state would have theirs.
+        would look like another mounting or focal length. Where more than 40 % of the observations
+        are theirs, the estimate is wrong and not they. Where moving objects are estimated, frames
+        before there is a state would have theirs.
         """
         if not self._frames:
             return []
         judged = [kept for kept in self._frames if kept.judged] or self._frames
         still = [kept.features.without(self._objects.moved) for kept in judged]
-        known = _Known.of_all([*(kept.known for kept in self._frames), *self._since])
-        left = [frame.without(known.rejected) for frame in still]
-        used = [frame.only(known.used) for frame in left]
-        if _count(used) >= _LEAST_USED * _count(still):
-            return used
+        since = [ids for _, ids in self._since]
+        rejected = np.unique(np.concatenate([*(kept.rejected for kept in self._frames), *since]))
+        left = [frame.without(rejected) for frame in still]
         return left if _count(left) >= _LEAST_LEFT * _count(still) else still
 
     @property
     def imu(self) -> ImuData:
         """All samples between them."""
-        return ImuData.concatenate([kept.known.imu for kept in self._frames])
+        return ImuData.concatenate([kept.imu for kept in self._frames])
 
     @property
     def pairs(self) -> list[CameraFrame]:
@@ -136,11 +101,13 @@ class KeptFrames:
     def add(self, frame: EstimatedFrame) -> None:
         """Keep a frame, if the last one was long enough ago, and forget old ones."""
         stamp_ns, frames = frame.features.stamp_ns, self._frames
-        self._since.append(_Known.of(frame))
+        self._since.append((frame.imu, frame.rejected))
         if frames and stamp_ns - frames[-1].features.stamp_ns < SPACING_NS:
             return
+        samples, rejected = zip(*self._since, strict=True)
+        since = ImuData.concatenate(samples), np.concatenate(rejected)
         judged = frame.objects is None or frame.state is not None
-        frames.append(_Kept(frame.features, _Known.of_all(self._since), judged))
+        frames.append(_Kept(frame.features, *since, judged))
         self._since = []
         while frames[0].features.stamp_ns < stamp_ns - KEPT_NS:
             frames.popleft()
