@@ -40,10 +40,10 @@ class _Cell:
     """A cell of the grid: columns [left, right) and rows [top, bottom) of the image.
 
     Attributes:
-        own: these, as a part of the image.
-        around: the same with a margin, as far as the image reaches.
-        inner: the cell, as a part of what is around it.
-        origin: (2,) the first pixel (u, v) of what is around it.
+        own: rows and columns of the cell in the image.
+        around: the same with a margin of 4 px, as far as the image reaches.
+        inner: rows and columns of the cell in `around`.
+        origin: (2,) first pixel (u, v) of `around`.
     """
 
     left: int
@@ -127,7 +127,7 @@ class FeatureExtractor:
         allowed = np.zeros((height, width), np.uint8)
         allowed[BORDER_PX : height - BORDER_PX, BORDER_PX : width - BORDER_PX] = 255
         self._allowed = allowed if mask is None else np.where(mask >= 128, allowed, np.uint8(0))
-        self._room = np.empty_like(self._allowed)
+        self._room = np.empty((height, width), np.uint8)
         self._half_widths = _disk(round(self._distance_px))
         self._rest = np.zeros(len(self._cells), np.int64)
         self._apart: Pixels = np.zeros((0, 2), np.float32)

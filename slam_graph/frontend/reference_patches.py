@@ -107,7 +107,7 @@ class ReferencePatches:
             self._ids, self._slots = self._ids[~which], self._slots[~which]
 
     def _slots_of(self, tracks: Tracks) -> IntArray:
-        """Where the patches of features are (N,), after those without one got one; else -1."""
+        """Slots (N,) of the patches of features, -1 where there is none; takes those missing."""
         assert tracks.image is not None
         slots = np.full(len(tracks), -1)
         if len(self._ids):

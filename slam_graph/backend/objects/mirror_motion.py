@@ -44,8 +44,8 @@ class MirrorMotion:
     def worse(self, members: IntArray, poses: dict[int, gtsam.Pose3]) -> float:
         """Squared errors over σ² of the mirror image less those of the motion.
 
-        Where that is clear already, the motion is taken as it is: fitted to the tracks once more,
-        as the mirror image is, it would be better still.
+        Above `MARGIN` it is at least so much: the motion is taken as it is then. Fitted to the
+        tracks once more, as the mirror image is, it would be better still.
 
         Args:
             members: (N,) ids of the tracks of an object, ascending.

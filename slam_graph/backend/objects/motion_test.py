@@ -26,11 +26,11 @@ from scipy.special import chdtri
 from slam_graph.arrays import BoolArray, FloatArray, IntArray
 from slam_graph.backend.backend_config import BackendConfig
 from slam_graph.backend.cost.feature_tracks import Observations
+from slam_graph.backend.cost.gating import threshold
 from slam_graph.backend.cost.reprojection import Geometry, RigProjection
 from slam_graph.backend.cost.triangulation import triangulate
 from slam_graph.backend.objects.ego_motion import EgoMotion
 from slam_graph.backend.objects.objects_config import ObjectsConfig
-from slam_graph.backend.objects.track_window import largest_squares
 from slam_graph.kernels.track_motion import motion_steps
 
 _STEPS = 4
@@ -103,8 +103,8 @@ class MotionTest:
 
     @property
     def moves(self) -> BoolArray:
-        """(J,) which tracks are not those of static points, as far as can be told."""
-        return self.verdicts >= Verdict.MOVING
+        """(J,) whose verdict is MOVING or WRONG."""
+        return np.asarray((self.verdicts == Verdict.MOVING) | (self.verdicts == Verdict.WRONG))
 
     def of(self, verdict: Verdict) -> IntArray:
         """Ids (N,) of the tracks with a verdict, ascending."""
@@ -157,7 +157,7 @@ def judge_tracks(
     speed = np.linalg.norm(velocities, axis=1)
     verdicts[~moving & (speed + 2.0 * largest < config.min_speed)] = Verdict.STATIC
     verdicts[moving] = Verdict.MOVING
-    verdicts[squares > largest_squares(dof, _MISFIT)] = Verdict.WRONG
+    verdicts[squares > threshold(dof, 1.0 - _MISFIT)] = Verdict.WRONG
     return MotionTest(
         obs.ids,
         points,

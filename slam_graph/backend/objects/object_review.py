@@ -77,7 +77,8 @@ class ObjectReview:
     def of(self, item: TrackedObject) -> list[Part]:
         """What an object is: nothing if it is as it is known, one part to begin again, or two."""
         least = self._config.min_points
-        # before it is estimated anew, which costs most: in its first frame that has no pose
+        # an estimate that begins anew, which costs most, has no pose in the first frame of the
+        # window; where the others cannot fill it, it is not made
         if not self._fill_the_window([s for s in self._window.stamps_ns[1:] if s in item.poses]):
             return []
         anew = self._begun(item.members)

@@ -15,10 +15,11 @@ import numpy as np
 
 from slam_graph.arrays import BoolArray, FloatArray, IntArray
 from slam_graph.backend.cost.feature_tracks import ascending_union, is_in
+from slam_graph.backend.cost.gating import threshold
 from slam_graph.backend.objects.ego_motion import EgoMotion
 from slam_graph.backend.objects.motion_test import MotionTest, Verdict
 from slam_graph.backend.objects.track_labels import TrackLabels
-from slam_graph.backend.objects.track_window import TrackWindow, largest_squares
+from slam_graph.backend.objects.track_window import TrackWindow
 from slam_graph.backend.objects.tracked_object import TrackedObject
 
 MARGIN = 12.0
@@ -87,7 +88,7 @@ class TrackAssignment:
         be called first: it finds how well tracks fit.
         """
         fit, squares, dof = self._misfit(item, item.members)
-        unfit = squares > _CLEARLY * _scale(squares, dof) * largest_squares(dof, _FITS)
+        unfit = squares > _CLEARLY * _scale(squares, dof) * threshold(dof, 1.0 - _FITS)
         leaving = ascending_union(fit[unfit], self._labels.contradicted(item.members, item.label))
         if not item.moving:
             return leaving
@@ -95,7 +96,7 @@ class TrackAssignment:
         fit, squares = fit[rest], squares[rest]
         frames = {stamp: pose for stamp, pose in self._static.items() if stamp in item.poses}
         same, alone, dof = self._window.misfit(fit, frames, self._sigma_px)
-        alone, limit = _for(fit, same, alone), _for(fit, same, largest_squares(dof, _FITS))
+        alone, limit = _for(fit, same, alone), _for(fit, same, threshold(dof, 1.0 - _FITS))
         static = (squares - alone > MARGIN) & (alone < limit)
         return ascending_union(leaving, fit[static])
 
@@ -119,7 +120,7 @@ class TrackAssignment:
         They are infinite where a track does not fit, or is not of its mask.
         """
         fit, errors, dof = self._misfit(item, self._labels.allowed(ids, item.label))
-        limit = self._scale(item) * largest_squares(dof, _FITS)
+        limit = self._scale(item) * threshold(dof, 1.0 - _FITS)
         return _for(ids, fit, np.where(errors < limit, errors, np.inf))
 
     def _as_static(self, ids: IntArray, wanted: BoolArray) -> FloatArray:

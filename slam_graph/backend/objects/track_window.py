@@ -6,11 +6,9 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Sequence
-from functools import lru_cache
 
 import gtsam
 import numpy as np
-from scipy.special import chdtri
 
 from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.backend.backend_config import BackendConfig
@@ -134,14 +132,3 @@ def squared_errors(obs: Observations, found: Triangulation, sigma_px: float) -> 
     """(J,) squared errors of features over σ²; infinite for those without a position."""
     squares = obs.counts * (found.reprojection_px / sigma_px) ** 2
     return np.asarray(np.where(np.isfinite(squares), squares, np.inf))
-
-
-def largest_squares(dof: IntArray, probability: float) -> FloatArray:
-    """(J,) squared errors over σ² that chance exceeds with a probability; dof (J,) of each."""
-    return _limits(int(dof.max(initial=1)), probability)[dof]
-
-
-@lru_cache(maxsize=64)
-def _limits(largest: int, probability: float) -> FloatArray:
-    """(largest + 1,) the same by degrees of freedom: few different ones are asked for."""
-    return np.asarray(chdtri(np.arange(largest + 1), probability))

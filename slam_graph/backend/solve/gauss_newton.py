@@ -178,7 +178,7 @@ class _DampedCost:
         self, cost: Cost, linear: Linearization | None, predicted: SquareRootInformation | None
     ) -> None:
         self._cost, self._layout, self._given = cost, cost.layout(), linear
-        # with new variables among its columns the QR would round otherwise
+        # with new variables among its columns the QR would round differently
         known = predicted is not None and predicted.layout is self._layout
         self._predicted = predicted if known else None
         self._delta: FloatArray | None = None
