@@ -172,6 +172,7 @@ class Estimation:
             imu_noise_at_limit=estimator.imu_noise_at_limit,
             rig_on_raw_clock=estimator.rig_on_raw_clock,
             clock_changes=estimator.clock_changes,
+            dynamic=estimator.dynamic,
         )
         self._note(frame, tracked)
         return frame

@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,6 +21,8 @@ _PAIRS, _PAIRS_APART_NS = 4, 1_500_000_000
 """Images of two cameras that are kept, and the time between them."""
 _LEAST_LEFT = 0.6
 """Features that the gate rejects are left out where this part of the observations is left."""
+_LEAST_USED = 0.4
+"""Those that were used tell enough by themselves where this part of the observations is theirs."""
 
 
 def _count(frames: list[FeatureFrame]) -> int:
@@ -28,20 +31,50 @@ def _count(frames: list[FeatureFrame]) -> int:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class _Known:
+    """What came with some frames.
+
+    Attributes:
+        imu: samples up to the last of them.
+        rejected: ids (N,) of the features that the gate rejected.
+        dynamic: ids (D,) of those that the estimator knows to move by themselves.
+        used: ids (M,) of those whose positions were estimated.
+    """
+
+    imu: ImuData
+    rejected: IntArray
+    dynamic: IntArray
+    used: IntArray
+
+    @staticmethod
+    def of(frame: EstimatedFrame) -> _Known:
+        """What came with one frame."""
+        return _Known(frame.imu, frame.rejected, frame.dynamic, frame.landmark_ids)
+
+    @staticmethod
+    def of_all(parts: Sequence[_Known]) -> _Known:
+        """What came with several frames, in their order."""
+        return _Known(
+            ImuData.concatenate([part.imu for part in parts]),
+            np.unique(np.concatenate([part.rejected for part in parts])),
+            np.unique(np.concatenate([part.dynamic for part in parts])),
+            np.unique(np.concatenate([part.used for part in parts])),
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class _Kept:
     """A frame that is kept.
 
     Attributes:
         features: what was found in it.
-        imu: the samples since the one before.
-        rejected: ids (N,) of the features that were rejected by the gate since then.
+        known: what came with it, and with the frames since the one before.
         judged: whether it was known what moves by itself: there was a state, or no objects are
             estimated.
     """
 
     features: FeatureFrame
-    imu: ImuData
-    rejected: IntArray
+    known: _Known
     judged: bool
 
 
@@ -57,7 +90,7 @@ class KeptFrames:
         """
         self._objects = objects
         self._frames: deque[_Kept] = deque()
-        self._since: list[tuple[ImuData, IntArray]] = []
+        self._since: list[_Known] = []
         self._pairs: deque[CameraFrame] | None = deque(maxlen=_PAIRS) if pairs else None
 
     def __len__(self) -> int:
@@ -69,22 +102,42 @@ class KeptFrames:
 
         Such are those of moving objects, and what the gate has rejected: a board before the camera
         would look like another mounting or focal length. Where more than 40 % of the observations
-        are theirs, the estimate is wrong and not they. Where moving objects are estimated, frames
-        before there is a state would have theirs.
+        are theirs, the estimate is wrong and not they.
         """
         if not self._frames:
             return []
-        judged = [kept for kept in self._frames if kept.judged] or self._frames
-        still = [kept.features.without(self._objects.moved) for kept in judged]
-        since = [ids for _, ids in self._since]
-        rejected = np.unique(np.concatenate([*(kept.rejected for kept in self._frames), *since]))
+        still, rejected = self._still(), self._known().rejected
         left = [frame.without(rejected) for frame in still]
         return left if _count(left) >= _LEAST_LEFT * _count(still) else still
 
     @property
+    def used_frames(self) -> list[FeatureFrame]:
+        """The same with those features only that the estimator used; [] where they are too few.
+
+        On a board before the camera some features are too new to be rejected.
+        """
+        if not self._frames:
+            return []
+        still, known = self._still(), self._known()
+        moving = np.concatenate([known.rejected, known.dynamic])
+        used = [frame.without(moving).only(known.used) for frame in still]
+        return used if _count(used) >= _LEAST_USED * _count(still) else []
+
+    def _still(self) -> list[FeatureFrame]:
+        """Features of the frames without those of moving objects, if it is known which these are.
+
+        Where moving objects are estimated, frames before there is a state would have theirs.
+        """
+        judged = [kept for kept in self._frames if kept.judged] or self._frames
+        return [kept.features.without(self._objects.moved) for kept in judged]
+
+    def _known(self) -> _Known:
+        return _Known.of_all([*(kept.known for kept in self._frames), *self._since])
+
+    @property
     def imu(self) -> ImuData:
         """All samples between them."""
-        return ImuData.concatenate([kept.imu for kept in self._frames])
+        return ImuData.concatenate([kept.known.imu for kept in self._frames])
 
     @property
     def pairs(self) -> list[CameraFrame]:
@@ -101,13 +154,11 @@ class KeptFrames:
     def add(self, frame: EstimatedFrame) -> None:
         """Keep a frame, if the last one was long enough ago, and forget old ones."""
         stamp_ns, frames = frame.features.stamp_ns, self._frames
-        self._since.append((frame.imu, frame.rejected))
+        self._since.append(_Known.of(frame))
         if frames and stamp_ns - frames[-1].features.stamp_ns < SPACING_NS:
             return
-        samples, rejected = zip(*self._since, strict=True)
-        since = ImuData.concatenate(samples), np.concatenate(rejected)
         judged = frame.objects is None or frame.state is not None
-        frames.append(_Kept(frame.features, *since, judged))
+        frames.append(_Kept(frame.features, _Known.of_all(self._since), judged))
         self._since = []
         while frames[0].features.stamp_ns < stamp_ns - KEPT_NS:
             frames.popleft()

@@ -62,6 +62,7 @@ class EstimatedFrame:
         imu_noise_at_limit: whether a noise density of the IMU was raised as far as it may be.
         rig_on_raw_clock: the calibration against the IMU samples of packets as they come now.
         clock_changes: of that clock so far; states are on the clock of the beginning.
+        dynamic: (D,) ids of the tracked features that the estimator knows to move by themselves.
     """
 
     packet: Packet
@@ -84,6 +85,7 @@ class EstimatedFrame:
     imu_noise_at_limit: bool = False
     rig_on_raw_clock: Rig | None = None
     clock_changes: Estimator.ClockChanges | None = None
+    dynamic: IntArray = field(default_factory=lambda: np.zeros(0, np.int64))
 
     @property
     def image(self) -> np.ndarray | None:

@@ -26,7 +26,7 @@ from slam_graph.pipeline.clock_watch import ClockWatch
 from slam_graph.pipeline.kept_frames import KEPT_NS, KeptFrames
 from slam_graph.pipeline.stage import COMPLETED, EstimatedFrame, NoObjects, Stage, warn_on_failure
 from slam_graph.results import RunResult
-from slam_graph.sensors import ImuData, Rig
+from slam_graph.sensors import FeatureFrame, ImuData, Rig
 
 if TYPE_CHECKING:
     from slam_graph.diagnosis import Diagnosis
@@ -243,13 +243,14 @@ class Verdict(Stage):
         found = self._diagnosed(self._result.input.rig if failed else self._final_rig())
         if clocks is not None:
             found = found.with_clocks(clocks)
-        ending, faults, guess = self._result.ending, found.setup_faults, found.best_guess()
+        ending, guess = self._result.ending, found.best_guess()
+        faults = found.setup_faults
         if failed and guess:
             if found.certain_errors:  # what the estimator guesses may contradict it
                 guess = found.certain_errors[0].with_fix
                 ending.message = ending.message.removesuffix(ending.waiting_for)
             ending.message += f"; slam-graph doctor says: {guess}"
-        elif faults and not failed:
+        elif faults and not failed and self._is_confirmed():
             likely = "; or ".join(finding.what for finding in faults[:2])
             self._suspect(f"{likely}; see `slam-graph doctor`")
         elif contradictions and not failed:
@@ -258,6 +259,16 @@ class Verdict(Stage):
             return
         ending.error = EstimationError(ending.message)
         logger.error("%s", ending.message)
+
+    def _is_confirmed(self) -> bool:
+        """Whether the features that the estimator used show a fault as well, or are too few.
+
+        A board that moves before the camera looks like another mounting, focal length or clock.
+        """
+        frames = self._kept.used_frames
+        if not frames:
+            return True
+        return bool(self._of_tracks(self._final_rig(), frames, self._kept.imu).setup_faults)
 
     def _suspect(self, why: str) -> None:
         """Say that the estimate may be wrong, and why."""
@@ -273,8 +284,6 @@ class Verdict(Stage):
             across_losses: whether losses of the estimate are looked at where too little else is
                 left.
         """
-        from slam_graph.diagnosis import Diagnosis  # it takes a moment to import
-
         kept, losses = self._kept, self._result.segments.losses
         frames, imu = kept.frames, kept.imu
         if not across_losses:
@@ -283,7 +292,13 @@ class Verdict(Stage):
             for begin_ns, end_ns in losses:
                 good &= (imu.stamps_ns <= begin_ns) | (imu.stamps_ns >= end_ns)
             imu = ImuData(imu.stamps_ns[good], imu.gyro[good], imu.accel[good])
-        return Diagnosis.of_tracks(rig, frames, imu, kept.pairs, losses)
+        return self._of_tracks(rig, frames, imu)
+
+    def _of_tracks(self, rig: Rig, frames: list[FeatureFrame], imu: ImuData) -> Diagnosis:
+        from slam_graph.diagnosis import Diagnosis  # it takes a moment to import
+
+        losses = self._result.segments.losses
+        return Diagnosis.of_tracks(rig, frames, imu, self._kept.pairs, losses)
 
     def _final_rig(self) -> Rig:
         """The rig as calibrated, corrected or estimated, whichever came last."""
