@@ -31,8 +31,9 @@ from slam_graph.backend.policies import AlgorithmConfig
 
 _LEAST_FRAMES = 3
 """Frames of a window that tell anything."""
-_AGAIN = 0.01
-"""Probability with which an object begins again without need; what it loses is its past."""
+_UNLIKE_ONE = 1.2
+"""An object is reviewed where its squared errors are so many times those that one body has in five
+of six frames: estimating its tracks anew costs most."""
 _LABEL = 2.0 * float(np.log(2.0))
 """What it costs that a track may be of either half: both are as likely."""
 _ROUNDS = 2
@@ -77,9 +78,7 @@ class ObjectReview:
     def of(self, item: TrackedObject) -> list[Part]:
         """What an object is: nothing if it is as it is known, one part to begin again, or two."""
         least = self._config.min_points
-        # an estimate that begins anew, which costs most, has no pose in the first frame of the
-        # window; where the others cannot fill it, it is not made
-        if not self._fill_the_window([s for s in self._window.stamps_ns[1:] if s in item.poses]):
+        if self._is_one_body(item):
             return []
         anew = self._begun(item.members)
         if anew is None:
@@ -105,15 +104,26 @@ class ObjectReview:
             apart = sum(self._total(half.members, half.motion, stamps) for half in halves)
             if min(current, best) - apart > limit + _LABEL * len(item.members):
                 return halves
-        again = float(chdtri(6 * (len(stamps) - 1), _AGAIN))
-        return [Part(item.members, part.motion)] if current - best > again else []
+        return [Part(item.members, part.motion)] if current - best > limit else []
+
+    def _is_one_body(self, item: TrackedObject) -> bool:
+        """Whether the errors of an object are those of one body, or it is too young to say."""
+        stamps = [stamp for stamp in self._window.stamps_ns if stamp in item.poses]
+        # an estimate that begins anew has no pose in the first frame of the window
+        if not self._fill_the_window(stamps[1:]):
+            return True
+        expected = _UNLIKE_ONE * self._expected(item.members, stamps)
+        return self._total(item.members, item, stamps) <= expected
 
     def _fill_the_window(self, stamps: list[int]) -> bool:
-        """Whether a motion is known over the whole window; earlier too many motions fit."""
+        """Whether a motion is known from the second frame of the window on, up to its last one.
+
+        Over less too many motions fit.
+        """
         if len(stamps) < _LEAST_FRAMES:
             return False
         period = (stamps[-1] - stamps[0]) / (len(stamps) - 1)
-        return len(stamps) * period > self._config.window_s * 1e9
+        return (len(stamps) + 1) * period > self._config.window_s * 1e9
 
     def _expected(self, members: IntArray, stamps: list[int]) -> float:
         """Sum of the squared errors of one body; larger ones are found in one of six frames."""
