@@ -265,7 +265,8 @@ class Estimator(EstimatorKnowledge):
         frame, bad = frame.usable(len(self.rig.cameras))
         if bad:
             self.diagnostics.warn("feature_not_finite", f"{bad} of them at {frame.stamp_ns} ns")
-        found = self._check.add(frame, imu, self.window is not None)
+        dynamic = self._standstill.dynamic
+        found = self._check.add(frame, imu, self.window is not None, dynamic)
         if isinstance(found, FoundCalibration):
             return self._begin_anew(found)
         self.clock_change = found or self.clock_change

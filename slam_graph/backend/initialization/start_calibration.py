@@ -16,6 +16,7 @@ from dataclasses import dataclass, replace
 import gtsam
 import numpy as np
 
+from slam_graph.arrays import IntArray
 from slam_graph.backend.backend_config import BackendConfig, CalibrationConfig
 from slam_graph.backend.initialization.clock_change import ClockChange
 from slam_graph.backend.initialization.clock_monitor import ClockMonitor
@@ -105,7 +106,7 @@ class StartCalibration:
         self.recent.clear()
 
     def add(
-        self, frame: FeatureFrame, imu: ImuBuffer, started: bool
+        self, frame: FeatureFrame, imu: ImuBuffer, started: bool, dynamic: IntArray
     ) -> FoundCalibration | ClockChange | None:
         """Take the next frame.
 
@@ -113,6 +114,7 @@ class StartCalibration:
             frame: its features.
             imu: samples so far.
             started: whether there is a state already.
+            dynamic: ids (D,) of the features that move by themselves, which are left out.
 
         Returns:
             A calibration that the old one contradicts, or a change of the clock since then; None as
@@ -124,6 +126,7 @@ class StartCalibration:
         while frame.stamp_ns - self.recent[0].stamp_ns > _RECENT_NS:
             self.recent.popleft()
         monitor = self._monitor if started else None
+        frame = frame.without(dynamic)
         if self.done:
             return self._watch(frame, imu, monitor)
         self._turns.add(frame, imu, self.mounted, _SPACING_NS)
