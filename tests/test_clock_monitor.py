@@ -19,6 +19,7 @@ from slam_graph.results import RunResult
 from slam_graph.sensors import FeatureFrame, ImuBuffer, ImuData
 
 CHANGED_S = 9.0
+NONE = np.zeros(0, np.int64)
 
 
 def flight(
@@ -46,7 +47,7 @@ def found_in(
         assert isinstance(packet.frame, FeatureFrame)
         imu.add(packet.imu)
         at_s = (packet.frame.stamp_ns - first_ns) * 1e-9
-        change = check.add(packet.frame, imu, started=at_s > 2.0)
+        change = check.add(packet.frame, imu, at_s > 2.0, NONE)
         if change is not None:
             found.append((at_s, change))
     return found
@@ -110,7 +111,7 @@ def test_a_gyroscope_that_says_nothing_is_no_error() -> None:
         assert isinstance(packet.frame, FeatureFrame)
         samples = packet.imu
         imu.add(ImuData(samples.stamps_ns, np.zeros_like(samples.gyro), samples.accel))
-        assert check.add(packet.frame, imu, started=True) is None
+        assert check.add(packet.frame, imu, True, NONE) is None
 
 
 def test_a_clock_that_was_corrected_at_the_start_may_change() -> None:

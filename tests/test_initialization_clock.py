@@ -4,6 +4,7 @@
 
 import json
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
 import gtsam
@@ -18,6 +19,7 @@ from slam_graph.arrays import FloatArray
 from slam_graph.backend.backend_config import BackendConfig, InitializationConfig
 from slam_graph.backend.estimator import Estimator
 from slam_graph.backend.initialization.gyro_alignment import Turns, align_gyroscope
+from slam_graph.backend.initialization.start_calibration import FoundCalibration, StartCalibration
 from slam_graph.backend.initialization.visual_rotation import visual_rotation
 from slam_graph.cli.main import app
 from slam_graph.config import load_config
@@ -28,7 +30,8 @@ from slam_graph.datasets.calibration.kalibr_calibration import (
 )
 from slam_graph.geometry.trajectory import NavState
 from slam_graph.kernels.epipolar_rotation_numpy import _Pair, _tangent
-from slam_graph.sensors.measurements import FeatureFrame, ImuData, Packet
+from slam_graph.sensors.imu_buffer import ImuBuffer
+from slam_graph.sensors.measurements import FeatureFrame, FeatureObservations, ImuData, Packet
 from slam_graph.sensors.rig import Rig
 from slam_graph.simulation.simulation_config import FlightConfig, SimulationConfig
 from slam_graph.simulation.simulator import simulate
@@ -172,6 +175,32 @@ def test_an_unknown_offset_is_found_in_the_start(offset_s: float, cameras: int) 
     last_ns = int(stream[-1].frame.stamp_ns + offset_s * 1e9)
     assert abs(last_ns - stamps_ns[-1]) < 75_000_000, "nor is the last one"
     assert errors_of(states).max() < 0.1
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_features_that_are_known_to_move_do_not_bend_the_clock(known: bool) -> None:
+    """Most features are on a body that turns as the world would under a clock 50 ms off."""
+    static = np.arange(100)
+    check, imu, found = StartCalibration(rig(1), BackendConfig()), ImuBuffer(), []
+    flown = recorded(0.0, 1, 5.0)
+    for before, packet in pairwise(flown):
+        assert isinstance(packet.frame, FeatureFrame)
+        assert isinstance(before.frame, FeatureFrame)
+        world, body = packet.frame.only(static).cameras[0], before.frame.without(static).cameras[0]
+        seen = FeatureObservations(
+            np.concatenate([world.ids, body.ids]),
+            np.vstack([world.pixels, body.pixels]),
+            np.vstack([world.normalized, body.normalized]),
+        )
+        imu.add(packet.imu)
+        dynamic = body.ids if known else np.zeros(0, np.int64)
+        frame = FeatureFrame(packet.frame.stamp_ns, (seen,))
+        found.append(check.add(frame, imu, started=True, dynamic=dynamic))
+    adopted = [one for one in found if isinstance(one, FoundCalibration)]
+    assert check.done
+    assert bool(adopted) != known
+    for one in adopted:
+        assert abs(one.rig.cameras[0].time_offset_s + 0.05) < 0.01
 
 
 @pytest.mark.parametrize("name", ["msckf", "okvis"])
