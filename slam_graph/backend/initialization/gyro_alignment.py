@@ -20,7 +20,14 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from slam_graph.arrays import BoolArray, FloatArray, IntArray, median, skew
+from slam_graph.arrays import (
+    BoolArray,
+    FloatArray,
+    IntArray,
+    median,
+    running_products,
+    skew,
+)
 from slam_graph.sensors import ImuData
 
 MAX_OFFSET_S = 0.12
@@ -112,11 +119,7 @@ class _Gyroscope:
         self._rate = imu.gyro
         mean = 0.5 * (imu.gyro[1:] + imu.gyro[:-1])
         steps = Rotation.from_rotvec(mean * np.diff(self._t)[:, None]).as_matrix()
-        R = np.empty((len(self._t), 3, 3))
-        R[0] = np.eye(3)
-        for k, step in enumerate(steps):
-            R[k + 1] = R[k] @ step
-        self._R = R
+        self._R = running_products(steps)
 
     def orientation(self, t: FloatArray) -> FloatArray:
         """start_R_body (..., 3, 3) at times (...) in seconds after the start."""
