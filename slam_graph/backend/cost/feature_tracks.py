@@ -202,19 +202,19 @@ class FeatureTracks:
 
     def add(self, index: int, frame: FeatureFrame) -> None:
         """Add the observations of a new frame, later than all before."""
-        cameras = frame.cameras
-        ids = np.concatenate([c.ids for c in cameras])
-        new = np.empty((3, len(ids)), np.int64)
-        new[0], new[1] = ids, index
-        new[2] = np.repeat(np.arange(len(cameras)), [len(c) for c in cameras])
-        pixels = np.concatenate([c.pixels for c in cameras])
-        normalized = np.concatenate([c.normalized for c in cameras])
-        self.seen = sorted_unique(np.sort(ids))
-        self.added += len(ids)
-        order = np.argsort(np.concatenate([self._ids, ids]), kind="stable")
-        self._numbers = np.concatenate([self._numbers, new], axis=1).take(order, axis=1)
-        self._places = np.concatenate([self._places, [pixels, normalized]], axis=1)
-        self._places = self._places.take(order, axis=1)
+        old, new = len(self), [len(camera) for camera in frame.cameras]
+        count = old + sum(new)
+        numbers, places = np.empty((3, count), np.int64), np.empty((2, count, 2))
+        numbers[:, :old], places[:, :old] = self._numbers, self._places
+        numbers[1, old:], begin = index, old
+        for number, (camera, size) in enumerate(zip(frame.cameras, new, strict=True)):
+            rows = slice(begin, begin := begin + size)
+            numbers[0, rows], numbers[2, rows] = camera.ids, number
+            places[0, rows], places[1, rows] = camera.pixels, camera.normalized
+        self.seen = sorted_unique(np.sort(numbers[0, old:]))
+        self.added += count - old
+        order = np.argsort(numbers[0], kind="stable")
+        self._numbers, self._places = numbers.take(order, axis=1), places.take(order, axis=1)
         self._group()
 
     def keep_frames(self, frames: Sequence[int]) -> None:

@@ -70,8 +70,8 @@ class Layout:
     def _columns_of(self, chosen: tuple[int, ...]) -> NDArray[np.intp]:
         if not chosen:
             return np.zeros(0, np.intp)
-        starts = np.array([self.starts[k] for k in chosen], np.intp)
-        sizes = [self.dims[k] for k in chosen]
+        starts = np.array(list(map(self.starts.__getitem__, chosen)), np.intp)
+        sizes = list(map(self.dims.__getitem__, chosen))
         if sizes.count(sizes[0]) == len(sizes):  # of poses, mostly
             return np.asarray((starts[:, None] + np.arange(sizes[0])).ravel(), np.intp)
         dims = np.array(sizes, np.intp)
