@@ -210,7 +210,7 @@ class FeatureObservations:
 
     def left_out(self, rows: BoolArray) -> FeatureObservations:
         """Those where `rows` (N,) does not hold; these themselves where it does nowhere."""
-        return self.select(~rows) if rows.any() else self
+        return self.select(~rows) if np.count_nonzero(rows) else self
 
 
 def _or_unknown(depths: FloatArray | None, count: int) -> FloatArray:
@@ -246,7 +246,8 @@ class FeatureFrame:
     def ids(self) -> IntArray:
         """The features (N,) that any camera sees, ascending."""
         ids = np.sort(np.concatenate([camera.ids for camera in self.cameras]))
-        new = np.ones(len(ids), np.bool_)
+        new = np.empty(len(ids), np.bool_)
+        new[:1] = True
         np.not_equal(ids[1:], ids[:-1], out=new[1:])
         return ids[new]
 
@@ -260,7 +261,8 @@ class FeatureFrame:
 
     def only(self, ids: IntArray) -> FeatureFrame:
         """The frame with these features only."""
-        cameras = (c.select(np.isin(c.ids, ids)) for c in self.cameras)
+        ascending = np.sort(ids)
+        cameras = (c.select(_are_among(c.ids, ascending)) for c in self.cameras)
         return FeatureFrame(self.stamp_ns, tuple(cameras))
 
     def usable(self, cameras: int) -> tuple[FeatureFrame, int]:
@@ -293,7 +295,9 @@ class FeatureFrame:
 
 
 def _are_among(ids: IntArray, ascending: IntArray) -> BoolArray:
-    """Which ids (N,) are among some ascending ones, at least one; `isin` takes far longer."""
+    """Which ids (N,) are among some ascending ones; NumPy's `isin` takes far longer."""
+    if not len(ascending):
+        return np.zeros(len(ids), np.bool_)
     places = np.minimum(ascending.searchsorted(ids), len(ascending) - 1)
     return np.asarray(ascending[places] == ids)
 

@@ -98,8 +98,8 @@ class Observations:
         """The observations of the features where `keep` (J,) holds."""
         if keep.all():
             return self
-        rows = np.flatnonzero(keep[self.feature])  # faster to take than a mask
-        renumbered = np.cumsum(keep) - 1
+        rows = keep[self.feature].nonzero()[0]  # faster to take than a mask
+        renumbered = keep.cumsum() - 1
         return Observations(
             self.ids[keep],
             self.frames,
@@ -190,9 +190,10 @@ class FeatureTracks:
     def _group(self) -> None:
         """Find the features, and where the observations of each begin."""
         self._ids, self._frames, self._cameras = self._numbers
-        begins = np.ones(len(self._ids) + 1, np.bool_)  # the last one is the end
+        begins = np.empty(len(self._ids) + 1, np.bool_)
+        begins[0] = begins[-1] = True  # the last one is the end
         np.not_equal(self._ids[1:], self._ids[:-1], out=begins[1:-1])
-        bounds = np.flatnonzero(begins)
+        bounds = begins.nonzero()[0]
         self._starts, self._counts = bounds[:-1], bounds[1:] - bounds[:-1]
         self._features = self._ids[self._starts]
 
@@ -250,12 +251,12 @@ class FeatureTracks:
             gone = is_in(self._features, ids) & stays
             self._count(outcome, counts[gone].sum())
             stays &= ~gone
-        left &= np.repeat(stays, self._counts)
+        left &= stays.repeat(self._counts)
         if frames is not None:
             late = left & ~_is_among(self._frames, frames)
             self._count(Outcome.POSE_LEFT, np.count_nonzero(late))
             left &= ~late
-        self._select(np.flatnonzero(left))
+        self._select(left.nonzero()[0])
 
     def _count(self, outcome: Outcome, count: int | np.int64) -> None:
         if count:
@@ -284,7 +285,7 @@ class FeatureTracks:
 
     def _rows_of_features(self, ids: IntArray) -> BoolArray:
         """Which observations (N,) are of some features (ascending ids)."""
-        return np.repeat(is_in(self._features, ids), self._counts)
+        return is_in(self._features, ids).repeat(self._counts)
 
     def frames(self, without: IntArray) -> set[int]:
         """The frames of all waiting observations but those of some features (ascending ids)."""
@@ -347,7 +348,7 @@ class FeatureTracks:
         wanted = self._rows_of_features(ids)
         if frames is not None:
             wanted &= _is_among(self._frames, frames)
-        rows = np.flatnonzero(wanted)
+        rows = wanted.nonzero()[0]
         features, numbers, cameras = self._numbers.take(rows, axis=1)
         pixels, normalized = self._places.take(rows, axis=1)
         order, frame = _numbered(numbers)
@@ -366,7 +367,7 @@ def _numbered(values: IntArray) -> tuple[IntArray, IntArray]:
     places = values - first
     table = np.zeros(places.max() + 1, np.bool_)
     table[places] = True
-    return np.flatnonzero(table) + first, (np.cumsum(table) - 1)[places]
+    return table.nonzero()[0] + first, (table.cumsum() - 1)[places]
 
 
 def _is_among(frames: IntArray, some: Sequence[int]) -> BoolArray:
@@ -386,8 +387,9 @@ def is_in(values: IntArray, ascending: IntArray) -> NDArray[np.bool_]:
 
 def sorted_unique(values: IntArray) -> IntArray:
     """The distinct values of an ascending array."""
-    first = np.ones(len(values), np.bool_)
-    first[1:] = values[1:] != values[:-1]
+    first = np.empty(len(values), np.bool_)
+    first[:1] = True
+    np.not_equal(values[1:], values[:-1], out=first[1:])
     return values[first]
 
 

@@ -13,7 +13,8 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from itertools import accumulate
+from itertools import accumulate, chain
+from operator import add
 
 import numpy as np
 from numpy.typing import NDArray
@@ -68,16 +69,10 @@ class Layout:
         return known
 
     def _columns_of(self, chosen: tuple[int, ...]) -> NDArray[np.intp]:
-        if not chosen:
-            return np.zeros(0, np.intp)
-        starts = np.array(list(map(self.starts.__getitem__, chosen)), np.intp)
+        starts = list(map(self.starts.__getitem__, chosen))
         sizes = list(map(self.dims.__getitem__, chosen))
-        if sizes.count(sizes[0]) == len(sizes):  # of poses, mostly
-            return np.asarray((starts[:, None] + np.arange(sizes[0])).ravel(), np.intp)
-        dims = np.array(sizes, np.intp)
-        # numbers that go on by one, but for a jump where a variable begins
-        jumps = starts - np.cumsum(dims) + dims
-        return np.asarray(np.arange(dims.sum()) + np.repeat(jumps, dims), np.intp)
+        ranges = map(range, starts, map(add, starts, sizes))
+        return np.fromiter(chain.from_iterable(ranges), np.intp, sum(sizes))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
