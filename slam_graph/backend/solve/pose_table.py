@@ -39,7 +39,7 @@ class PoseTable:
             matrices[:, :3, :3] = parts[:, :9].reshape(-1, 3, 3)
             matrices[:, :3, 3] = parts[:, 9:]
             matrices[:, 3, 3] = 1.0
-        return PoseTable({frame: row for row, frame in enumerate(frames)}, matrices)
+        return PoseTable(dict(zip(frames, range(len(frames)), strict=True)), matrices)
 
     def poses(self, frames: Iterable[int]) -> tuple[FloatArray, FloatArray]:
         """Rotations (K, 3, 3) and positions (K, 3) of some of the frames, in the order given."""

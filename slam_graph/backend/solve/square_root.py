@@ -71,6 +71,9 @@ class Layout:
     def _columns_of(self, chosen: tuple[int, ...]) -> NDArray[np.intp]:
         starts = list(map(self.starts.__getitem__, chosen))
         sizes = list(map(self.dims.__getitem__, chosen))
+        if sizes and sizes.count(sizes[0]) == len(sizes):  # of poses, mostly
+            columns = np.array(starts, np.intp)[:, None] + np.arange(sizes[0])
+            return np.asarray(columns.ravel(), np.intp)
         ranges = map(range, starts, map(add, starts, sizes))
         return np.fromiter(chain.from_iterable(ranges), np.intp, sum(sizes))
 
@@ -331,7 +334,7 @@ def _solved(R: FloatArray, d: FloatArray) -> FloatArray:
     if len(d) == 0:
         return np.zeros(0)
     x, info = lapack.dtrtrs(R, d)
-    if info != 0 or not np.all(np.isfinite(x)):
+    if info != 0 or not np.isfinite(x).all():
         raise np.linalg.LinAlgError("the cost does not determine all of its variables")
     return np.asarray(x, dtype=np.float64)
 

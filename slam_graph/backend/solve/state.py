@@ -194,16 +194,22 @@ class State:
 
     def poses(self, frames: Iterable[int], first: bool = False) -> tuple[FloatArray, FloatArray]:
         """Rotations (F, 3, 3) and positions (F, 3) of some frames, or their first estimates."""
-        known = self._first_poses if first else self._poses
+        known, other = self._poses, self._first_poses
+        if first:
+            known, other = other, known
         if known is None:
-            codes = [key for key in self._offsets if key >> LETTER_SHIFT == _POSE_CODE]
-            indices = sorted(key & INDEX_MASK for key in codes)
+            indices = self._indices() if other is None else list(other.rows)
             known = PoseTable.of(self.first_frames if first else self.frames, indices)
             if first:
                 self._first_poses = known
             else:
                 self._poses = known
         return known.poses(frames)
+
+    def _indices(self) -> list[int]:
+        """Frames that have a pose, ascending."""
+        keys = [key for key in self._offsets if key >> LETTER_SHIFT == _POSE_CODE]
+        return sorted(key & INDEX_MASK for key in keys)
 
     def positions_of(self, features: IntArray, first: bool = False) -> FloatArray:
         """Positions (N, 3) of some features, or their first estimates.
