@@ -16,7 +16,6 @@ __all__ = [
     "GrowingTable",
     "IntArray",
     "median",
-    "running_products",
     "skew",
 ]
 
@@ -83,16 +82,6 @@ def skew(v: FloatArray) -> FloatArray:
     matrix[..., 2, 1], matrix[..., 0, 2], matrix[..., 1, 0] = x, y, z
     matrix[..., 1, 2], matrix[..., 2, 0], matrix[..., 0, 1] = -x, -y, -z
     return matrix
-
-
-def running_products(steps: FloatArray) -> FloatArray:
-    """The products (N + 1, 3, 3) I, S₁, S₁ S₂, … of matrices S (N, 3, 3) that follow each other."""
-    products = np.empty((len(steps) + 1, 3, 3))
-    products[0] = np.eye(3)
-    rows = list(products)  # views; and `dot` into one of them takes half of the time of `@`
-    for before, step, after in zip(rows[:-1], steps, rows[1:], strict=True):
-        np.dot(before, step, after)
-    return products
 
 
 def median(values: NDArray[Any]) -> FloatArray:

@@ -7,7 +7,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from slam_graph.arrays import FloatArray, IntArray, running_products
+from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.sensors import ImuData
 
 
@@ -31,7 +31,7 @@ class Gyroscope:
         durations_s, rates, _ = imu.steps()
         turns = rates * durations_s[:, None]
         self.integral = np.concatenate([np.zeros((1, 3)), np.cumsum(turns, axis=0)])
-        self.R = running_products(Rotation.from_rotvec(turns).as_matrix())
+        self.R = imu.chained(Rotation.from_rotvec(turns).as_matrix())
 
     def seconds(self, stamps_ns: IntArray) -> FloatArray:
         """Times (...) of stamps (...) on the clock of the IMU."""

@@ -77,6 +77,16 @@ class ImuData:
             start_R_end = start_R_end * gtsam.Rot3.Expmap(turn)
         return start_R_end
 
+    @staticmethod
+    def chained(turns: FloatArray) -> FloatArray:
+        """Rotations start_R_body (N + 1, 3, 3) at samples from those (N, 3, 3) between them."""
+        rotations = np.empty((len(turns) + 1, 3, 3))
+        rotations[0] = np.eye(3)
+        rows = list(rotations)  # views; and `dot` into one of them takes half of the time of `@`
+        for before, turn, after in zip(rows[:-1], turns, rows[1:], strict=True):
+            np.dot(before, turn, after)
+        return rotations
+
     def preintegrated(
         self, bias: gtsam.imuBias.ConstantBias, params: gtsam.PreintegrationCombinedParams
     ) -> gtsam.PreintegratedCombinedMeasurements:

@@ -204,8 +204,8 @@ class FeatureTracks:
     def add(self, index: int, frame: FeatureFrame) -> None:
         """Add the observations of a new frame, later than all before."""
         old, new = len(self), [len(camera) for camera in frame.cameras]
-        count = old + sum(new)
-        numbers, places = np.empty((3, count), np.int64), np.empty((2, count, 2))
+        numbers = np.empty((3, old + sum(new)), np.int64)
+        places = np.empty((2, numbers.shape[1], 2))
         numbers[:, :old], places[:, :old] = self._numbers, self._places
         numbers[1, old:], begin = index, old
         for number, (camera, size) in enumerate(zip(frame.cameras, new, strict=True)):
@@ -213,7 +213,7 @@ class FeatureTracks:
             numbers[0, rows], numbers[2, rows] = camera.ids, number
             places[0, rows], places[1, rows] = camera.pixels, camera.normalized
         self.seen = sorted_unique(np.sort(numbers[0, old:]))
-        self.added += count - old
+        self.added += sum(new)
         order = np.argsort(numbers[0], kind="stable")
         self._numbers, self._places = numbers.take(order, axis=1), places.take(order, axis=1)
         self._group()
@@ -279,8 +279,7 @@ class FeatureTracks:
     def _key(self, ids: IntArray, frames: IntArray, cameras: IntArray) -> IntArray:
         """A number (N,) for each observation that no other one has."""
         first = self._frames.min(initial=0)
-        span = self._frames.max(initial=0) - first + 1
-        count = self._cameras.max(initial=0) + 1
+        span, count = self._frames.max(initial=0) - first + 1, self._cameras.max(initial=0) + 1
         return np.asarray((ids * span + frames - first) * count + cameras, dtype=np.int64)
 
     def _rows_of_features(self, ids: IntArray) -> BoolArray:
@@ -337,10 +336,10 @@ class FeatureTracks:
         """All features with waiting observations (J,), and the number of frames that see each."""
         if len(self) == 0:
             return self._features, np.zeros(0, np.int64)
-        again = self._frames[1:] == self._frames[:-1]  # by the next camera
-        again[self._starts[1:] - 1] = False
-        seen_again = np.concatenate([[False], again])
-        repeated: IntArray = np.add.reduceat(seen_again, self._starts, dtype=np.int64)
+        again = np.empty(len(self), np.bool_)  # by the next camera
+        np.equal(self._frames[1:], self._frames[:-1], out=again[1:])
+        again[self._starts] = False
+        repeated: IntArray = np.add.reduceat(again, self._starts, dtype=np.int64)
         return self._features, self._counts - repeated
 
     def observations(self, ids: IntArray, frames: Sequence[int] | None = None) -> Observations:

@@ -20,14 +20,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from slam_graph.arrays import (
-    BoolArray,
-    FloatArray,
-    IntArray,
-    median,
-    running_products,
-    skew,
-)
+from slam_graph.arrays import BoolArray, FloatArray, IntArray, median, skew
 from slam_graph.sensors import ImuData
 
 MAX_OFFSET_S = 0.12
@@ -119,7 +112,7 @@ class _Gyroscope:
         self._rate = imu.gyro
         mean = 0.5 * (imu.gyro[1:] + imu.gyro[:-1])
         steps = Rotation.from_rotvec(mean * np.diff(self._t)[:, None]).as_matrix()
-        self._R = running_products(steps)
+        self._R = imu.chained(steps)
 
     def orientation(self, t: FloatArray) -> FloatArray:
         """start_R_body (..., 3, 3) at times (...) in seconds after the start."""
