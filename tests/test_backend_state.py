@@ -15,8 +15,9 @@ from slam_graph.backend.cost.feature_factors import SummedFeatures
 from slam_graph.backend.cost.reprojection import RigProjection
 from slam_graph.backend.cost.triangulation import first_centres
 from slam_graph.backend.marginalization.marginalize import marginalize
+from slam_graph.backend.solve.layout_parts import LayoutParts
 from slam_graph.backend.solve.square_root import Layout, SquareRootInformation, triangularize
-from slam_graph.backend.solve.stacked_values import stacked_points
+from slam_graph.backend.solve.stacked_values import stacked_points, stacked_poses
 from slam_graph.backend.solve.state import (
     State,
     dim,
@@ -26,6 +27,7 @@ from slam_graph.backend.solve.state import (
     letter_and_index,
 )
 from slam_graph.geometry.trajectory import NavState
+from slam_graph.sensors import FeatureFrame, FeatureObservations, ImuData
 
 KEYS = [L(5), X(0), X(1), V(1), B(1)]
 
@@ -53,6 +55,67 @@ def assert_same_values(a: gtsam.Values, b: gtsam.Values, atol: float = 1e-12) ->
     difference = a.localCoordinates(b)
     for key in a.keys():  # noqa: SIM118
         np.testing.assert_allclose(difference.at(key), 0.0, atol=atol)
+
+
+def test_poses_are_those_of_the_values(state: State) -> None:
+    """To the bit, also where a camera's pose is a variable, after a step and with a new frame."""
+    mounting = gtsam.Values()
+    mounting.insert(E(1), pose3=gtsam.Pose3())
+    state.insert_calibration(mounting)
+    keys = [E(1), *imu_state_keys(0), *imu_state_keys(1)]
+    for _ in range(2):
+        for first, values in ((False, state.frames), (True, state.first_frames)):
+            for frames in ([0, 1], [1, 0], [1], []):
+                found, expected = state.poses(frames, first), stacked_poses(values, frames)
+                assert all(np.array_equal(a, b) for a, b in zip(found, expected, strict=True))
+        state.update(layout(keys), delta(keys))
+        state.relinearize()
+    state.insert_imu_state(2, Flight().nav_state(0.6))
+    state.remove(imu_state_keys(0))
+    assert np.array_equal(state.poses([2, 1])[1], stacked_poses(state.frames, [2, 1])[1])
+
+
+def test_parts_of_a_layout() -> None:
+    """Features and others are told apart, wherever they stand."""
+    columns, some = layout([X(0), L(5), V(1), L(2)]), np.arange(15.0)
+    parts = LayoutParts.of(columns)
+    assert parts.keys == [X(0), V(1)]
+    assert parts.features.tolist() == [5, 2]
+    assert some[parts.of_points].tolist() == [[6.0, 7.0, 8.0], [12.0, 13.0, 14.0]]
+    of_others = some[parts.of_others]
+    tangents = {key: of_others[s] for key, s in zip(parts.keys, parts.slices, strict=True)}
+    assert tangents[V(1)].tolist() == [9.0, 10.0, 11.0]
+    assert np.array_equal(parts.stacked(tangents), of_others)
+
+
+def test_columns_are_in_the_order_of_the_keys() -> None:
+    """Of variables of one size and of several."""
+    columns = layout(KEYS)
+    for keys in ([X(1), X(0)], [B(1), L(5), X(0)], [V(1)], []):
+        expected = [c for key in keys for c in range(*columns.columns[key].indices(columns.size))]
+        assert columns.indices(keys).tolist() == expected
+
+
+def test_features_of_a_frame() -> None:
+    """Their ids, and the frame without some of them."""
+    none = np.zeros((3, 2))
+    cameras = [FeatureObservations(np.array(ids), none, none) for ids in ([7, 2, 9], [9, 3, 2])]
+    frame = FeatureFrame(0, tuple(cameras))
+    assert frame.ids.tolist() == [2, 3, 7, 9]
+    left = frame.without(np.array([11, 7, 3]))
+    assert [camera.ids.tolist() for camera in left.cameras] == [[2, 9], [9, 2]]
+    assert frame.without(np.array([5])).cameras == frame.cameras
+    only = frame.only(np.array([11, 7, 3]))
+    assert [camera.ids.tolist() for camera in only.cameras] == [[7], [3]]
+    assert all(len(camera) == 0 for camera in frame.only(np.zeros(0, np.int64)).cameras)
+
+
+def test_chained_rotations() -> None:
+    """As products one after the other."""
+    turns = [gtsam.Rot3.Rodrigues(0.1 * k, 0.2, 0.3).matrix() for k in range(3)]
+    chained = ImuData.chained(np.array(turns))
+    np.testing.assert_allclose(chained[-1], turns[0] @ turns[1] @ turns[2], atol=1e-15)
+    assert np.array_equal(chained[0], np.eye(3))
 
 
 def test_dimensions() -> None:

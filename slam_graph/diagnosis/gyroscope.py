@@ -31,11 +31,7 @@ class Gyroscope:
         durations_s, rates, _ = imu.steps()
         turns = rates * durations_s[:, None]
         self.integral = np.concatenate([np.zeros((1, 3)), np.cumsum(turns, axis=0)])
-        R = np.empty((len(self.t), 3, 3))
-        R[0] = np.eye(3)
-        for k, step in enumerate(Rotation.from_rotvec(turns).as_matrix()):
-            R[k + 1] = R[k] @ step
-        self.R = R
+        self.R = imu.chained(Rotation.from_rotvec(turns).as_matrix())
 
     def seconds(self, stamps_ns: IntArray) -> FloatArray:
         """Times (...) of stamps (...) on the clock of the IMU."""

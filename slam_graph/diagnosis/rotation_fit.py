@@ -152,6 +152,7 @@ class RotationProblem:
         rows = self._pixels[..., 1] / camera.camera.height - 0.5
         self._row = np.where(self._there, rows, 0.0)
         self._bearings: dict[float, tuple[FloatArray, FloatArray, BoolArray]] = {}
+        self._latest: tuple[Kinematics, _Turned] | None = None
 
     def bearings(self, focal: float) -> tuple[FloatArray, FloatArray, BoolArray]:
         """Unit bearings (2, P, N, 3) with a factor on the focal lengths, and their derivatives.
@@ -175,7 +176,16 @@ class RotationProblem:
         return self._bearings[focal]
 
     def _turned(self, at: Kinematics) -> _Turned:
-        """Bearings of both frames, turned into the camera of the first one."""
+        """Bearings of both frames, turned into the camera of the first one.
+
+        The last ones are kept: a step asks for those at the same values several times.
+        """
+        if self._latest is None or self._latest[0] is not at:
+            self._latest = at, self._turned_at(at)
+        return self._latest[1]
+
+    def _turned_at(self, at: Kinematics) -> _Turned:
+        """`_turned` computed anew."""
         f, slopes, _ = self.bearings(at.focal)
         C, t = at.body_R_camera, self._t + at.offset_s
         R, rates = np.empty((2, len(self._part), 3, 3)), np.empty((2, len(self._part), 3))

@@ -5,11 +5,8 @@
 from __future__ import annotations
 
 import math
-from bisect import bisect_right
 from collections import deque
 from dataclasses import dataclass
-from itertools import islice
-from operator import attrgetter
 
 import numpy as np
 
@@ -115,6 +112,8 @@ class Disagreement:
     def __init__(self, interval_s: float, limit: float, what: str) -> None:
         self._interval_s, self._limit, self._what = interval_s, limit, what
         self._tests: deque[_Test] = deque()
+        self._recent: deque[_Test] = deque()  # those that the share is taken over
+        self._tested = self._rejected = 0  # sums over these
         self._tested_s = 0.0
         self._last_ns: int | None = None
         self._earlier_ns: int | None = None  # of the newest test that is not kept any more
@@ -136,20 +135,30 @@ class Disagreement:
         self._last_ns = stamp_ns
         new = _Test(stamp_ns, self._tested_s, tested, rejected)
         self._tests.append(new)
+        self._recent.append(new)
+        self._tested += tested
+        self._rejected += rejected
         begin_s = self._tested_s - self._interval_s
         while self._tests[0].tested_s < begin_s - _LOOKED_BACK * self._interval_s:
             self._earlier_ns = self._tests.popleft().stamp_ns
         if self._tests[0].tested_s > begin_s:
             return
-        late = bisect_right(self._tests, begin_s, key=attrgetter("tested_s"))
-        recent = list(islice(self._tests, late - 1, None))
-        share = sum(test.rejected for test in recent) / sum(test.tested for test in recent)
+        self._forget_recent(begin_s)
+        share = self._rejected / self._tested
         if share > self._limit:
             raise DivergenceError(
                 f"diverged at frame {stamp_ns}: images contradict the state, {share:.0%} of "
                 f"what was seen in {self._interval_s:g} s {self._what} (the limit is "
                 f"{self._limit:.0%})"
             )
+
+    def _forget_recent(self, begin_s: float) -> None:
+        """Let the share begin with the last test that is not later than a time, of tests so far."""
+        recent = self._recent
+        while len(recent) > 1 and recent[1].tested_s <= begin_s:
+            old = recent.popleft()
+            self._tested -= old.tested
+            self._rejected -= old.rejected
 
     def untested(self, stamp_ns: int) -> None:
         """Note a frame before the first test: nothing is held against it."""
@@ -194,10 +203,11 @@ class Corrections:
 
     def note(self, frame: FeatureFrame) -> None:
         """Note whether the tracks of the frame before go on in this one."""
-        ids = np.unique(np.concatenate([seen.ids for seen in frame.cameras]))
+        ids = frame.ids
         if not len(ids):
             return
-        if np.count_nonzero(np.isin(self._ids, ids)) < _FOUND_AGAIN * len(self._ids):
+        places = np.minimum(ids.searchsorted(self._ids), len(ids) - 1)
+        if np.count_nonzero(ids[places] == self._ids) < _FOUND_AGAIN * len(self._ids):
             self._broken_ns = frame.stamp_ns
         self._ids = ids
 
@@ -247,8 +257,8 @@ class Bridging:
     """
 
     def __init__(self) -> None:
-        self._last: tuple[int, float] | None = None  # time and sigma of the last state
-        self._before: tuple[int, float] | None = None  # the same before samples were missing
+        self._last: NavState | None = None
+        self._before: NavState | None = None  # the last one before samples were missing
         self._sampled = 0
         self._agreed_ns: int | None = None
 
@@ -268,18 +278,18 @@ class Bridging:
         """
         if state.covariance is None:
             return
-        sigma = math.sqrt(float(np.linalg.eigvalsh(state.covariance[6:9, 6:9])[-1]))
         if missed:
             self._before = self._last if self._before is None else self._before
             self._sampled = 0
-        self._last = state.stamp_ns, sigma
+        self._last = state
         if missed or self._before is None:
             return
+        sigma = _velocity_sigma(state)
         self._sampled += 1
-        if sigma <= max(_KNOWN_VELOCITY, _LESS_KNOWN * self._before[1]):
+        if sigma <= max(_KNOWN_VELOCITY, _LESS_KNOWN * _velocity_sigma(self._before)):
             self._before = None
         elif self._sampled >= _SAMPLED_FRAMES:
-            self._agreed_ns = self._before[0]
+            self._agreed_ns = self._before.stamp_ns
             raise DivergenceError(
                 f"lost at frame {state.stamp_ns}: IMU samples were missing, and images do not tell "
                 f"the velocity (σ of {sigma:.2g} m/s)"
@@ -288,3 +298,9 @@ class Bridging:
     def agreed_until(self) -> int | None:
         """Time of the last state before samples were missing; None without."""
         return self._agreed_ns
+
+
+def _velocity_sigma(state: NavState) -> float:
+    """Largest standard deviation of the velocity along any axis, m/s."""
+    assert state.covariance is not None, "only such states are kept"
+    return math.sqrt(float(np.linalg.eigvalsh(state.covariance[6:9, 6:9])[-1]))

@@ -233,5 +233,7 @@ def packets_of(sequence: Sequence, asked: RunInput) -> Iterator[Packet]:
 def _first_cameras(frame: CameraFrame | FeatureFrame, count: int) -> CameraFrame | FeatureFrame:
     """The same frame without the cameras that are not used."""
     if isinstance(frame, CameraFrame):
+        if len(frame.images) <= count:
+            return frame
         return replace(frame, images=frame.images[:count])
     return replace(frame, cameras=frame.cameras[:count], outliers=())

@@ -44,7 +44,7 @@ class ImuBuffer:
 
     def forget_before(self, stamp_ns: int) -> None:
         """Drop the samples before the last one at or before `stamp_ns`."""
-        first = int(np.searchsorted(self.data.stamps_ns, stamp_ns, side="right")) - 1
+        first = int(self.data.stamps_ns.searchsorted(stamp_ns, side="right")) - 1
         if first > 0:
             self.data = self.data[first:]
 
@@ -90,11 +90,15 @@ class ImuBuffer:
         if after == 0 or after == len(samples):
             held = max(after - 1, 0)
             return samples.gyro[held], samples.accel[held]
-        stamps = samples.stamps_ns[after - 1 : after + 1].tolist()
-        start_s, end_s, at_s = ((t - zero_ns) * 1e-9 for t in (*stamps, stamp_ns))
-        found = (values[after - 1 : after + 1] for values in (samples.gyro, samples.accel))
-        gyro, accel = ((b - a) / (end_s - start_s) * (at_s - start_s) + a for a, b in found)
-        return gyro, accel
+        start_ns, end_ns = samples.stamps_ns[after - 1 : after + 1].tolist()
+        start_s, end_s = (start_ns - zero_ns) * 1e-9, (end_ns - zero_ns) * 1e-9
+        at_s = (stamp_ns - zero_ns) * 1e-9
+        gyro, accel, whole_s = samples.gyro[after - 1], samples.accel[after - 1], end_s - start_s
+        part_s = at_s - start_s
+        return (
+            (samples.gyro[after] - gyro) / whole_s * part_s + gyro,
+            (samples.accel[after] - accel) / whole_s * part_s + accel,
+        )
 
     def trend(self, stamp_ns: int, around_ns: int) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Angular rate, its derivative, and specific force at a time, by lines fitted around it.

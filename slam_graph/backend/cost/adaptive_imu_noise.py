@@ -160,8 +160,12 @@ class DensityScales:
         surprise = np.minimum(np.minimum(persistence, sizes), _MAX_SQUARE) - 1.0
         responses_s = np.where(surprise > 0.0, RESPONSE_TIME_S, self.fall_times_s)
         factors = self.factors * np.exp(0.5 * surprise * dt_s / responses_s)
+        factors = np.minimum(np.maximum(factors, 1.0), MAX_FACTOR)
+        if np.count_nonzero(known) == len(known):
+            self._directions, self._sizes, self.factors = directions, sizes, factors
+            return
         self._directions[known], self._sizes[known] = directions[known], sizes[known]
-        self.factors[known] = np.minimum(np.maximum(factors, 1.0), MAX_FACTOR)[known]
+        self.factors[known] = factors[known]
 
 
 class DynamicsNoise:

@@ -318,7 +318,7 @@ class Cost:
         after = first_centres(tracks.obs, self.rig.at(state), state)
         points = moved_in_inverse_depth(tracks.points, increments, before, after)
         points[own] = state.positions_of(tracks.obs.ids[own])
-        self.tracks = replace(tracks, points=points)
+        self.tracks = TrackFeatures(tracks.obs, points, own)
 
     def snapshot(self) -> tuple[State, TrackFeatures | None]:
         """What `apply` changes, to be given back to `restore`."""

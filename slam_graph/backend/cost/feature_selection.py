@@ -148,7 +148,8 @@ class FeatureSelection:
         points[good] = known_points[np.searchsorted(known_ids, obs.ids[good])]
         here = window.state.frames.atPose3(X(window.frame)).translation()
         # steps may have sent a feature with little parallax to infinity
-        good &= np.linalg.norm(points - here, axis=1) < self.config.triangulation.max_depth_m
+        away = np.sqrt(np.add.reduce((points - here) ** 2, axis=1))
+        good &= away < self.config.triangulation.max_depth_m
         if not good.all():
             new, rig = ~good, self.rig.at(window.state)
             poses = rig.when_taken(obs.frames, *window.state.poses(obs.frames))

@@ -98,8 +98,8 @@ class Observations:
         """The observations of the features where `keep` (J,) holds."""
         if keep.all():
             return self
-        rows = np.flatnonzero(keep[self.feature])  # faster to take than a mask
-        renumbered = np.cumsum(keep) - 1
+        rows = keep[self.feature].nonzero()[0]  # faster to take than a mask
+        renumbered = keep.cumsum() - 1
         return Observations(
             self.ids[keep],
             self.frames,
@@ -190,9 +190,10 @@ class FeatureTracks:
     def _group(self) -> None:
         """Find the features, and where the observations of each begin."""
         self._ids, self._frames, self._cameras = self._numbers
-        begins = np.ones(len(self._ids) + 1, np.bool_)  # the last one is the end
+        begins = np.empty(len(self._ids) + 1, np.bool_)
+        begins[0] = begins[-1] = True  # the last one is the end
         np.not_equal(self._ids[1:], self._ids[:-1], out=begins[1:-1])
-        bounds = np.flatnonzero(begins)
+        bounds = begins.nonzero()[0]
         self._starts, self._counts = bounds[:-1], bounds[1:] - bounds[:-1]
         self._features = self._ids[self._starts]
 
@@ -202,19 +203,19 @@ class FeatureTracks:
 
     def add(self, index: int, frame: FeatureFrame) -> None:
         """Add the observations of a new frame, later than all before."""
-        cameras = frame.cameras
-        ids = np.concatenate([c.ids for c in cameras])
-        new = np.empty((3, len(ids)), np.int64)
-        new[0], new[1] = ids, index
-        new[2] = np.repeat(np.arange(len(cameras)), [len(c) for c in cameras])
-        pixels = np.concatenate([c.pixels for c in cameras])
-        normalized = np.concatenate([c.normalized for c in cameras])
-        self.seen = sorted_unique(np.sort(ids))
-        self.added += len(ids)
-        order = np.argsort(np.concatenate([self._ids, ids]), kind="stable")
-        self._numbers = np.concatenate([self._numbers, new], axis=1).take(order, axis=1)
-        self._places = np.concatenate([self._places, [pixels, normalized]], axis=1)
-        self._places = self._places.take(order, axis=1)
+        old, new = len(self), [len(camera) for camera in frame.cameras]
+        numbers = np.empty((3, old + sum(new)), np.int64)
+        places = np.empty((2, numbers.shape[1], 2))
+        numbers[:, :old], places[:, :old] = self._numbers, self._places
+        numbers[1, old:], begin = index, old
+        for number, (camera, size) in enumerate(zip(frame.cameras, new, strict=True)):
+            rows = slice(begin, begin := begin + size)
+            numbers[0, rows], numbers[2, rows] = camera.ids, number
+            places[0, rows], places[1, rows] = camera.pixels, camera.normalized
+        self.seen = sorted_unique(np.sort(numbers[0, old:]))
+        self.added += sum(new)
+        order = np.argsort(numbers[0], kind="stable")
+        self._numbers, self._places = numbers.take(order, axis=1), places.take(order, axis=1)
         self._group()
 
     def keep_frames(self, frames: Sequence[int]) -> None:
@@ -250,12 +251,12 @@ class FeatureTracks:
             gone = is_in(self._features, ids) & stays
             self._count(outcome, counts[gone].sum())
             stays &= ~gone
-        left &= np.repeat(stays, self._counts)
+        left &= stays.repeat(self._counts)
         if frames is not None:
             late = left & ~_is_among(self._frames, frames)
             self._count(Outcome.POSE_LEFT, np.count_nonzero(late))
             left &= ~late
-        self._select(np.flatnonzero(left))
+        self._select(left.nonzero()[0])
 
     def _count(self, outcome: Outcome, count: int | np.int64) -> None:
         if count:
@@ -278,13 +279,12 @@ class FeatureTracks:
     def _key(self, ids: IntArray, frames: IntArray, cameras: IntArray) -> IntArray:
         """A number (N,) for each observation that no other one has."""
         first = self._frames.min(initial=0)
-        span = self._frames.max(initial=0) - first + 1
-        count = self._cameras.max(initial=0) + 1
+        span, count = self._frames.max(initial=0) - first + 1, self._cameras.max(initial=0) + 1
         return np.asarray((ids * span + frames - first) * count + cameras, dtype=np.int64)
 
     def _rows_of_features(self, ids: IntArray) -> BoolArray:
         """Which observations (N,) are of some features (ascending ids)."""
-        return np.repeat(is_in(self._features, ids), self._counts)
+        return is_in(self._features, ids).repeat(self._counts)
 
     def frames(self, without: IntArray) -> set[int]:
         """The frames of all waiting observations but those of some features (ascending ids)."""
@@ -336,10 +336,10 @@ class FeatureTracks:
         """All features with waiting observations (J,), and the number of frames that see each."""
         if len(self) == 0:
             return self._features, np.zeros(0, np.int64)
-        again = self._frames[1:] == self._frames[:-1]  # by the next camera
-        again[self._starts[1:] - 1] = False
-        seen_again = np.concatenate([[False], again])
-        repeated: IntArray = np.add.reduceat(seen_again, self._starts, dtype=np.int64)
+        again = np.empty(len(self), np.bool_)  # by the next camera
+        np.equal(self._frames[1:], self._frames[:-1], out=again[1:])
+        again[self._starts] = False
+        repeated: IntArray = np.add.reduceat(again, self._starts, dtype=np.int64)
         return self._features, self._counts - repeated
 
     def observations(self, ids: IntArray, frames: Sequence[int] | None = None) -> Observations:
@@ -347,7 +347,7 @@ class FeatureTracks:
         wanted = self._rows_of_features(ids)
         if frames is not None:
             wanted &= _is_among(self._frames, frames)
-        rows = np.flatnonzero(wanted)
+        rows = wanted.nonzero()[0]
         features, numbers, cameras = self._numbers.take(rows, axis=1)
         pixels, normalized = self._places.take(rows, axis=1)
         order, frame = _numbered(numbers)
@@ -366,7 +366,7 @@ def _numbered(values: IntArray) -> tuple[IntArray, IntArray]:
     places = values - first
     table = np.zeros(places.max() + 1, np.bool_)
     table[places] = True
-    return np.flatnonzero(table) + first, (np.cumsum(table) - 1)[places]
+    return table.nonzero()[0] + first, (table.cumsum() - 1)[places]
 
 
 def _is_among(frames: IntArray, some: Sequence[int]) -> BoolArray:
@@ -386,8 +386,9 @@ def is_in(values: IntArray, ascending: IntArray) -> NDArray[np.bool_]:
 
 def sorted_unique(values: IntArray) -> IntArray:
     """The distinct values of an ascending array."""
-    first = np.ones(len(values), np.bool_)
-    first[1:] = values[1:] != values[:-1]
+    first = np.empty(len(values), np.bool_)
+    first[:1] = True
+    np.not_equal(values[1:], values[:-1], out=first[1:])
     return values[first]
 
 

@@ -219,7 +219,14 @@ class Propagation:
         if last is None or last.covariance is None:
             return
         transition = _Transition.of(factor, window.state.frames)
-        self._predicted = replace(predicted, covariance=transition.predicted(last.covariance))
+        self._predicted = NavState(
+            predicted.stamp_ns,
+            predicted.world_T_body,
+            predicted.velocity,
+            accel_bias=predicted.accel_bias,
+            gyro_bias=predicted.gyro_bias,
+            covariance=transition.predicted(last.covariance),
+        )
         if self._counts_vibration():
             dt_s = (window.stamp_ns - last.stamp_ns) * 1e-9
             self._vibration.predict(transition.matrix, dt_s, self.noise.vibrates)

@@ -75,14 +75,14 @@ def triangulate(
     points, depth_error, parallax = np.empty((count, 3)), np.empty(count), np.empty(count)
     triangulate_rays(*cameras, obs.normalized, weights, starts, points, depth_error, parallax)
     residuals, depths = rig.residuals(obs, Geometry(rotations, positions, points))
-    squares = np.bincount(obs.feature, np.sum(residuals**2, axis=1), count)
+    squares = np.bincount(obs.feature, np.add.reduce(residuals**2, axis=1), count)
     good = (
-        np.all(np.isfinite(points), axis=1)
+        np.isfinite(points).all(axis=1)
         & (np.minimum.reduceat(depths, starts[:-1]) > config.min_depth_m)
         & (depths[starts[:-1]] < config.max_depth_m)
         & (parallax > max(config.min_parallax_rad, min_parallax_rad))
     )
-    return Triangulation(points, good, np.sqrt(squares / np.diff(starts)), depth_error)
+    return Triangulation(points, good, np.sqrt(squares / (starts[1:] - starts[:-1])), depth_error)
 
 
 def moved_in_inverse_depth(
@@ -101,8 +101,8 @@ def moved_in_inverse_depth(
         after: (J, 3) the same where the step has moved them.
     """
     rays, increments = points - before, increments - (after - before)
-    nearer = -np.sum(increments * rays, axis=1, keepdims=True)
-    nearer /= np.maximum(np.sum(rays**2, axis=1, keepdims=True), _TINY)
+    nearer = -np.add.reduce(increments * rays, axis=1, keepdims=True)
+    nearer /= np.maximum(np.add.reduce(rays**2, axis=1, keepdims=True), _TINY)
     across = increments + nearer * rays
     return np.asarray(after + (rays + across) / np.maximum(1.0 + nearer, _LEAST_INVERSE_DEPTH))
 

@@ -57,7 +57,7 @@ class VibrationCovariance:
     @property
     def vanishes(self) -> bool:
         """Whether nothing has vibrated so far."""
-        return not self._X.any()
+        return not np.count_nonzero(self._X)
 
     def predict(self, transition: FloatArray, dt_s: float, vibrates: bool) -> None:
         """Predict a frame from the last one that was corrected.

@@ -112,11 +112,7 @@ class _Gyroscope:
         self._rate = imu.gyro
         mean = 0.5 * (imu.gyro[1:] + imu.gyro[:-1])
         steps = Rotation.from_rotvec(mean * np.diff(self._t)[:, None]).as_matrix()
-        R = np.empty((len(self._t), 3, 3))
-        R[0] = np.eye(3)
-        for k, step in enumerate(steps):
-            R[k + 1] = R[k] @ step
-        self._R = R
+        self._R = imu.chained(steps)
 
     def orientation(self, t: FloatArray) -> FloatArray:
         """start_R_body (..., 3, 3) at times (...) in seconds after the start."""

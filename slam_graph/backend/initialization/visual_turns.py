@@ -12,6 +12,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from slam_graph.arrays import FloatArray
+from slam_graph.backend.cost.feature_tracks import is_in
 from slam_graph.backend.initialization.gyro_alignment import MAX_OFFSET_S, MIN_TURNS, Turns
 from slam_graph.backend.initialization.visual_rotation import MIN_COMMON, visual_rotation
 from slam_graph.sensors import FeatureFrame, ImuBuffer, ImuData, RigCamera
@@ -99,7 +100,7 @@ class VisualTurns:
             self._turns.popleft()
         now, model = frame.cameras[0], (self._camera.camera, self._pixel_sigma)
         for before in self._frames:
-            common = len(np.intersect1d(before.cameras[0].ids, now.ids, assume_unique=True))
+            common = np.count_nonzero(is_in(now.ids, np.sort(before.cameras[0].ids)))
             if common < (_ENOUGH_COMMON if before is not self._frames[-1] else MIN_COMMON):
                 continue
             turn = visual_rotation(before.cameras[0], now, *model, self._expected(frame, before))

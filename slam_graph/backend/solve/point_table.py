@@ -49,8 +49,8 @@ class PointTable:
         if len(ids) == 0:
             return np.zeros(0, np.intp)
         rows = self.ids.searchsorted(ids)
-        found = len(self.ids) > 0 and rows.max() < len(self.ids)
-        if not found or (self.ids[rows] != ids).any():
+        known = len(self.ids) > 0 and self.ids.take(rows, mode="clip") == ids
+        if np.count_nonzero(known) < len(ids):
             raise KeyError(f"not all of the features {ids.tolist()} are variables")
         return rows
 
@@ -99,7 +99,7 @@ class PointTable:
             return self
         frozen = self.frozen.copy()
         frozen[self.rows(ids)] = True
-        return replace(self, frozen=frozen)
+        return PointTable(self.ids, self.first, self.offsets, frozen)
 
     def relinearized(self, frozen: BoolArray) -> PointTable:
         """With all linearisation points at the estimates, but those that are `frozen` (J,)."""

@@ -13,7 +13,8 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from itertools import accumulate
+from itertools import accumulate, chain
+from operator import add
 
 import numpy as np
 from numpy.typing import NDArray
@@ -68,16 +69,13 @@ class Layout:
         return known
 
     def _columns_of(self, chosen: tuple[int, ...]) -> NDArray[np.intp]:
-        if not chosen:
-            return np.zeros(0, np.intp)
-        starts = np.array([self.starts[k] for k in chosen], np.intp)
-        sizes = [self.dims[k] for k in chosen]
-        if sizes.count(sizes[0]) == len(sizes):  # of poses, mostly
-            return np.asarray((starts[:, None] + np.arange(sizes[0])).ravel(), np.intp)
-        dims = np.array(sizes, np.intp)
-        # numbers that go on by one, but for a jump where a variable begins
-        jumps = starts - np.cumsum(dims) + dims
-        return np.asarray(np.arange(dims.sum()) + np.repeat(jumps, dims), np.intp)
+        starts = list(map(self.starts.__getitem__, chosen))
+        sizes = list(map(self.dims.__getitem__, chosen))
+        if sizes and sizes.count(sizes[0]) == len(sizes):  # of poses, mostly
+            columns = np.array(starts, np.intp)[:, None] + np.arange(sizes[0])
+            return np.asarray(columns.ravel(), np.intp)
+        ranges = map(range, starts, map(add, starts, sizes))
+        return np.fromiter(chain.from_iterable(ranges), np.intp, sum(sizes))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -336,7 +334,7 @@ def _solved(R: FloatArray, d: FloatArray) -> FloatArray:
     if len(d) == 0:
         return np.zeros(0)
     x, info = lapack.dtrtrs(R, d)
-    if info != 0 or not np.all(np.isfinite(x)):
+    if info != 0 or not np.isfinite(x).all():
         raise np.linalg.LinAlgError("the cost does not determine all of its variables")
     return np.asarray(x, dtype=np.float64)
 

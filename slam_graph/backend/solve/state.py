@@ -18,15 +18,21 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
-from functools import lru_cache
 
 import gtsam
 import numpy as np
-from gtsam.symbol_shorthand import B, D, L, V, X
+from gtsam.symbol_shorthand import B, D, V, X
 from scipy.spatial.transform import Rotation
 
 from slam_graph.arrays import FloatArray, IntArray
+from slam_graph.backend.solve.layout_parts import (
+    FIRST_POINT,
+    LETTER_SHIFT,
+    LayoutParts,
+    told_apart,
+)
 from slam_graph.backend.solve.point_table import PointTable
+from slam_graph.backend.solve.pose_table import PoseTable
 from slam_graph.backend.solve.square_root import Layout
 from slam_graph.geometry import NavState
 
@@ -37,18 +43,15 @@ DIMS = _IMU_STATE_DIMS | _CALIBRATION_DIMS
 """Tangent dimension by the letter of the symbol. Distortion coefficients (`d`) are not here: their
 number depends on the camera model, and their keys carry it (see `distortion_key`)."""
 
-_LETTER_SHIFT = 56  # GTSAM's symbols: the letter is in the highest of eight bytes
-INDEX_MASK = (1 << _LETTER_SHIFT) - 1
+INDEX_MASK = (1 << LETTER_SHIFT) - 1
 _COUNT_SHIFT = 16
 _DIMS_BY_CODE = {ord(letter): size for letter, size in DIMS.items()}
-_DISTORTION_CODE = ord("d")
-_FIRST_POINT, _POINT_CODE = L(0), ord("l")
-_POINT_COLUMNS = np.arange(POINT_DIM)
+_DISTORTION_CODE, _POSE_CODE = ord("d"), ord("x")
 
 
 def dim(key: int) -> int:
     """Tangent dimension of the variable of a key."""
-    code = key >> _LETTER_SHIFT
+    code = key >> LETTER_SHIFT
     if code == _DISTORTION_CODE:
         return (key & INDEX_MASK) >> _COUNT_SHIFT
     return _DIMS_BY_CODE[code]
@@ -69,7 +72,7 @@ def distortion_key(camera: int, coefficients: int) -> int:
 
 def letter_and_index(key: int) -> tuple[str, int]:
     """The letter of a key, and the index of its frame, feature or camera."""
-    letter, index = chr(key >> _LETTER_SHIFT), key & INDEX_MASK
+    letter, index = chr(key >> LETTER_SHIFT), key & INDEX_MASK
     return letter, index & ((1 << _COUNT_SHIFT) - 1) if letter == "d" else index
 
 
@@ -141,8 +144,8 @@ class State:
         self.motions: dict[int, FrameMotion] = {}
         self._offsets: dict[int, FloatArray] = {}  # arrays are replaced, copies share them
         self._frozen: set[int] = set()
-        self._poses: dict[int, FloatArray] = {}  # matrices of poses as far as they were asked for
-        self._first_poses: dict[int, FloatArray] = {}
+        self._poses: PoseTable | None = None  # once they were asked for
+        self._first_poses: PoseTable | None = None
 
     def copy(self) -> State:
         """An independent copy."""
@@ -156,7 +159,7 @@ class State:
         self.first_frames = gtsam.Values(other.first_frames)
         self.points, self.motions = other.points, dict(other.motions)
         self._offsets, self._frozen = dict(other._offsets), set(other._frozen)
-        self._poses, self._first_poses = dict(other._poses), dict(other._first_poses)
+        self._poses, self._first_poses = other._poses, other._first_poses
 
     # --- reading ---------------------------------------------------------------------------------
 
@@ -191,16 +194,22 @@ class State:
 
     def poses(self, frames: Iterable[int], first: bool = False) -> tuple[FloatArray, FloatArray]:
         """Rotations (F, 3, 3) and positions (F, 3) of some frames, or their first estimates."""
-        values, known = self.frames, self._poses
+        known, other = self._poses, self._first_poses
         if first:
-            values, known = self.first_frames, self._first_poses
-        matrices = np.empty((len(indices := list(frames)), 4, 4))
-        for row, i in enumerate(indices):
-            matrix = known.get(i)
-            if matrix is None:
-                matrix = known[i] = values.atPose3(X(i)).matrix()
-            matrices[row] = matrix
-        return matrices[:, :3, :3], matrices[:, :3, 3]
+            known, other = other, known
+        if known is None:
+            indices = self._indices() if other is None else list(other.rows)
+            known = PoseTable.of(self.first_frames if first else self.frames, indices)
+            if first:
+                self._first_poses = known
+            else:
+                self._poses = known
+        return known.poses(frames)
+
+    def _indices(self) -> list[int]:
+        """Frames that have a pose, ascending."""
+        keys = [key for key in self._offsets if key >> LETTER_SHIFT == _POSE_CODE]
+        return sorted(key & INDEX_MASK for key in keys)
 
     def positions_of(self, features: IntArray, first: bool = False) -> FloatArray:
         """Positions (N, 3) of some features, or their first estimates.
@@ -213,10 +222,9 @@ class State:
 
     def offset(self, layout: Layout) -> FloatArray:
         """Stacked offset (n,) of the estimates from the linearisation points."""
-        parts, offset = _parts(layout), np.empty(layout.size)
-        for key, columns in parts.others:
-            offset[columns] = self._offsets[key]
-        offset[parts.columns] = self.points.offsets[self.points.rows(parts.features)]
+        parts, offset = LayoutParts.of(layout), np.empty(layout.size)
+        offset[parts.of_others] = parts.stacked(self._offsets)
+        offset[parts.of_points] = self.points.offsets[self.points.rows(parts.features)]
         return offset
 
     def nav_state(self, frame: int, stamp_ns: int, covariance: FloatArray | None) -> NavState:
@@ -241,6 +249,7 @@ class State:
     def _insert(self, values: gtsam.Values, keys: Iterable[int]) -> None:
         self.frames.insert(values)
         self.first_frames.insert(values)
+        self._poses = self._first_poses = None
         for key in keys:
             self._offsets[key] = np.zeros(dim(key))
 
@@ -254,15 +263,14 @@ class State:
 
     def remove(self, keys: Iterable[int]) -> None:
         """Forget variables."""
-        others, features = _told_apart(keys)
+        others, features = told_apart(keys)
         self.points = self.points.without(features)
+        self._poses = self._first_poses = None
         for key in others:
             self.frames.erase(key)
             self.first_frames.erase(key)
             del self._offsets[key]
             self._frozen.discard(key)
-            self._poses.pop(key & INDEX_MASK, None)
-            self._first_poses.pop(key & INDEX_MASK, None)
         if self.motions:
             self.motions = {i: m for i, m in self.motions.items() if X(i) in self._offsets}
 
@@ -277,11 +285,11 @@ class State:
                 tangents.insert(key, offset)
                 self._offsets[key] = np.zeros(len(offset))
         if tangents.size():  # as the estimates were made, so that they are the same to the bit
-            self.first_frames, self._first_poses = self.first_frames.retract(tangents), {}
+            self.first_frames, self._first_poses = self.first_frames.retract(tangents), None
 
     def freeze(self, keys: Iterable[int]) -> None:
         """Hold the linearisation points of variables where they are."""
-        others, features = _told_apart(keys)
+        others, features = told_apart(keys)
         self._frozen.update(others)
         self.points = self.points.with_frozen(features)
 
@@ -295,14 +303,14 @@ class State:
 
     def update(self, layout: Layout, delta: FloatArray) -> None:
         """Add an increment (n,) to the tangents at the linearisation points."""
-        parts = _parts(layout)
-        self.points = self.points.moved(parts.features, delta[parts.columns])
-        for key, columns in parts.others:
-            self._offsets[key] = self._offsets[key] + delta[columns]
+        parts = LayoutParts.of(layout)
+        self.points = self.points.moved(parts.features, delta[parts.of_points])
+        moved = parts.stacked(self._offsets) + delta[parts.of_others]
+        self._offsets.update(zip(parts.keys, map(moved.__getitem__, parts.slices), strict=True))
         tangents = gtsam.VectorValues()
         for key, offset in self._offsets.items():
             tangents.insert(key, offset)
-        self.frames, self._poses = self.first_frames.retract(tangents), {}
+        self.frames, self._poses = self.first_frames.retract(tangents), None
 
     def moved(self, motion: gtsam.Pose3) -> State:
         """The same state in a world that is moved.
@@ -323,43 +331,8 @@ class State:
         for key, offset in self._offsets.items():  # those of poses are of the body
             if letter_and_index(key)[0] == "v":
                 other._offsets[key] = turn @ offset
-        other._poses, other._first_poses = {}, {}
+        other._poses = other._first_poses = None
         return other
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Parts:
-    """A layout, with the features apart.
-
-    Attributes:
-        others: keys and columns of all variables but features.
-        features: ids (J,) of the features.
-        columns: (J, 3) of these.
-    """
-
-    others: list[tuple[int, slice]]
-    features: IntArray
-    columns: IntArray
-
-
-@lru_cache(maxsize=8)
-def _parts(layout: Layout) -> _Parts:
-    """The parts of a layout: one is asked for several times in a step."""
-    keys = np.fromiter(layout.dims, np.int64, len(layout.dims))
-    dims = np.fromiter(layout.dims.values(), np.int64, len(keys))
-    ends = dims.cumsum()
-    starts, points = ends - dims, keys >> _LETTER_SHIFT == _POINT_CODE
-    columns, rest = starts[points][:, None] + _POINT_COLUMNS, ~points
-    slices = map(slice, starts[rest].tolist(), ends[rest].tolist())
-    others = list(zip(keys[rest].tolist(), slices, strict=True))
-    return _Parts(others, keys[points] - _FIRST_POINT, columns)
-
-
-def _told_apart(keys: Iterable[int]) -> tuple[list[int], IntArray]:
-    """Keys of all variables but features, and ids (J,) of the features."""
-    chosen = np.array(keys if isinstance(keys, list) else list(keys), np.int64)
-    points = chosen >> _LETTER_SHIFT == _POINT_CODE
-    return chosen[~points].tolist(), chosen[points] - _FIRST_POINT
 
 
 def _joined(frames: gtsam.Values, ids: IntArray, points: FloatArray) -> gtsam.Values:
@@ -386,12 +359,12 @@ def nav_state_in(
 
 def features_of(layout: Layout) -> IntArray:
     """Ids (J,) of the features of a layout, in the order of its columns."""
-    return _parts(layout).features
+    return LayoutParts.of(layout).features
 
 
 def landmark_keys(ids: IntArray) -> list[int]:
     """Keys of features (J,): GTSAM's symbols have their index in the lowest bits."""
-    keys: list[int] = (ids + _FIRST_POINT).tolist()
+    keys: list[int] = (ids + FIRST_POINT).tolist()
     return keys
 
 
