@@ -179,6 +179,25 @@ def test_track_windows(levels: int) -> None:
     assert 20 < np.count_nonzero(results[0][1]) < 140
 
 
+@pytest.mark.parametrize("side", [1, 2, 5])
+def test_track_windows_of_black_and_white(side: int) -> None:
+    # the largest derivatives, and weights of which one is rounded to -1
+    rng = np.random.default_rng(10)
+    squares = rng.integers(0, 2, (200 // side, 200 // side), np.uint8) * np.uint8(255)
+    image = np.ascontiguousarray(np.kron(squares, np.ones((side, side), np.uint8)))
+    fractions = rng.choice([0.0, 0.0004873, 0.012, 0.5, 0.9945], (200, 2))
+    points = (rng.integers(5, 195, (200, 2)) + fractions).astype(np.float32)
+    start = points + rng.choice([0.0, 0.25, 1.0], points.shape).astype(np.float32)
+    images = *with_halvings(image, 1), *with_halvings(image, 1)
+    results = [
+        form(*images, points, start, 1, 5, 15, 0.02, 1e-3)
+        for form in (track_windows, track_windows_numpy)
+    ]
+    for ours, theirs in zip(*results, strict=True):
+        np.testing.assert_array_equal(ours, theirs)
+    assert np.count_nonzero(results[0][1]) > 100
+
+
 def test_track_windows_is_opencv() -> None:
     rng = np.random.default_rng(9)
     image, other = two_images()

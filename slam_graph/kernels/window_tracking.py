@@ -9,7 +9,10 @@ OpenCV's are rounded in an order that depends on the machine.
 
 A window is a flat array, in rows of `_STRIDE` numbers of which the last three are not used: a loop
 over all of it is made of vectors, if the compiler knows the _STRIDE. `np.int32(…)` around a product
-keeps Numba from computing in 64 bits, which would double their number.
+keeps Numba from computing in 64 bits, which would double their number; in 16 bits it is halved. A
+weight of 14 bits is 64 h + l, and four of them sum up to 2^14, so the sum of their products with
+grey values v is S = 64 H + L, where H = Σ h v and L = Σ l v are below 2^16. Derivatives have five
+bits more, so for them S is 2048 A + B: those of A and those of B fit into 16 bits with their sign.
 """
 
 from __future__ import annotations
@@ -32,6 +35,9 @@ _WEIGHT_BITS = 14
 _IMAGE_BITS = _WEIGHT_BITS - 5
 """Bits that are rounded off: grey values in a window keep five after the point."""
 
+_LOW_BITS, _HALF_BITS = 6, 11
+"""Bits of the lower part of a weight, and of that of a sum of products."""
+
 _ONE, _WHOLE = np.float32(1.0), np.float32(1 << _WEIGHT_BITS)
 _SCALE = np.float32(1.0 / (1 << 20))
 """Of sums of products, so that the smallest eigenvalue is in OpenCV's unit."""
@@ -46,9 +52,10 @@ _BLOCK = 64
 _LENGTH = -(-WINDOW_PX * _STRIDE // _BLOCK) * _BLOCK
 """Of a window, made up to whole blocks."""
 
-_VECTOR = 32
+_VECTOR = 24
 """Pixels that are copied at once. The next row overwrites those that are too many."""
 
+_i16, _u16 = np.int16, np.uint16
 _at = np.uintp
 """An index without a sign. Numba would test others for negative ones, and not use vectors."""
 
@@ -58,6 +65,7 @@ _Window = NDArray[np.int16]
 _Errors = NDArray[np.float32]
 _Pixels = NDArray[np.float32]
 _Weights = tuple[np.int32, np.int32, np.int32, np.int32]
+_Parts = tuple[np.uint16, np.uint16, np.uint16, np.uint16]
 
 
 @compiled()
@@ -102,31 +110,98 @@ def _copy(image: _Image, u: int, v: int, rows: int, out: _Window) -> None:
 
 
 @compiled()
-def _blend(values: _Window, start: int, weights: _Weights, bits: int, out: _Window) -> None:
-    """Bilinear interpolation between four values each, with `bits` rounded off."""
+def _split(weights: _Weights) -> tuple[_Parts, _Parts]:
+    """The upper and the lower parts of weights. Of -1, which rounding gives, they are -1 and 63."""
     a, b, c, d = weights
-    half = np.int32(1 << (bits - 1))
+    low = (1 << _LOW_BITS) - 1
+    upper = _u16(a >> _LOW_BITS), _u16(b >> _LOW_BITS), _u16(c >> _LOW_BITS), _u16(d >> _LOW_BITS)
+    return upper, (_u16(a & low), _u16(b & low), _u16(c & low), _u16(d & low))
+
+
+@compiled()
+def _weighted(values: _Window, k: int, parts: _Parts) -> np.uint16:
+    """The sum of four values, times parts of their weights."""
+    (a, b, c, d), m, n = parts, _at(k), _at(k + _STRIDE)
+    upper = _u16(_u16(a * values[m]) + _u16(b * values[m + _at(1)]))
+    return _u16(upper + _u16(_u16(c * values[n]) + _u16(d * values[n + _at(1)])))
+
+
+@compiled()
+def _blend(values: _Window, weights: _Weights, out: _Window) -> None:
+    """Bilinear interpolation between four grey values each, of which five bits are kept."""
+    above, below = _split(weights)
+    half = _u16(1 << (_IMAGE_BITS - _LOW_BITS - 1))
     for k in range(_LENGTH):
-        m = _at(start + k)
-        upper = np.int32(a * values[m]) + np.int32(b * values[m + _at(1)])
-        m += _at(_STRIDE)
-        lower = np.int32(c * values[m]) + np.int32(d * values[m + _at(1)])
-        out[_at(k)] = np.int16(np.int32(upper + lower + half) >> bits)
+        upper, lower = _weighted(values, k, above), _weighted(values, k, below)
+        total = _u16(_u16(upper + half) + _u16(lower >> _LOW_BITS))
+        out[_at(k)] = _u16(total >> (_IMAGE_BITS - _LOW_BITS))
+
+
+@compiled()
+def _blend_in_halves(values: _Window, weights: _Weights, high: _Window, low: _Window) -> None:
+    """The same with all bits, of the window and the pixels around it: 2048 (high - 1) + low."""
+    above, below = _split(weights)
+    bits = _HALF_BITS - _LOW_BITS
+    one = _u16(1 << bits)  # added, so that no sum is negative where a weight is
+    rest, lowest = _u16((1 << bits) - 1), _u16((1 << _LOW_BITS) - 1)
+    for k in range(_LENGTH + 2 * _STRIDE + 2):
+        upper, lower = _weighted(values, k, above), _weighted(values, k, below)
+        total = _u16(_u16(upper + one) + _u16(lower >> _LOW_BITS))
+        high[_at(k)] = _u16(total >> bits)
+        low[_at(k)] = _u16(_u16(_u16(total & rest) << _LOW_BITS) | _u16(lower & lowest))
+
+
+@compiled()
+def _middle(high: _Window, low: _Window, out: _Window) -> None:
+    """The grey values of a window, with five bits after the point, by those of two halves."""
+    one, half = _i16(1), _i16(1 << (_IMAGE_BITS - 1))
+    for k in range(_LENGTH):
+        m = _at(k + _STRIDE + 1)
+        upper = _i16(_i16(high[m] - one) << (_HALF_BITS - _IMAGE_BITS))
+        out[_at(k)] = _i16(upper + _i16(_i16(low[m] + half) >> _IMAGE_BITS))
+
+
+@compiled()
+def _scharr(values: _Window, k: int) -> tuple[np.int16, np.int16]:
+    """Scharr's derivatives at the second value of the row behind that of `k`."""
+    three, ten = _i16(3), _i16(10)
+    o, m, n = _at(k), _at(k + _STRIDE), _at(k + 2 * _STRIDE)
+    falling, rising = _i16(values[n + _at(2)] - values[o]), _i16(values[o + _at(2)] - values[n])
+    right = _i16(values[m + _at(2)] - values[m])
+    down = _i16(values[n + _at(1)] - values[o + _at(1)])
+    x = _i16(_i16(three * _i16(falling + rising)) + _i16(ten * right))
+    return x, _i16(_i16(three * _i16(falling - rising)) + _i16(ten * down))
+
+
+@compiled()
+def _slopes(high: _Window, low: _Window, used: _Window, gx: _Window, gy: _Window) -> None:
+    """Derivatives of grey values in two halves, rounded; zero where `used` is."""
+    bits, half = _WEIGHT_BITS - _HALF_BITS, _i16(1 << (_WEIGHT_BITS - _HALF_BITS - 1))
+    for k in range(_LENGTH):
+        (x, y), (low_x, low_y) = _scharr(high, k), _scharr(low, k)
+        x = _i16(_i16(x + half) + _i16(low_x >> _HALF_BITS))
+        y = _i16(_i16(y + half) + _i16(low_y >> _HALF_BITS))
+        gx[_at(k)] = _i16(x >> bits) & used[_at(k)]
+        gy[_at(k)] = _i16(y >> bits) & used[_at(k)]
 
 
 @compiled()
 def _differentiate(pixels: _Window, dx: _Window, dy: _Window) -> None:
-    """Scharr's derivatives, from the second pixel of the second row on."""
-    three, ten = np.int16(3), np.int16(10)
+    """Derivatives from the second pixel of the second row on."""
     for k in range(_LENGTH + _STRIDE + 1):
-        m, n = _at(k + _STRIDE), _at(k + 2 * _STRIDE)
-        falling = np.int16(pixels[n + _at(2)] - pixels[_at(k)])
-        rising = np.int16(pixels[_at(k + 2)] - pixels[n])
-        right = np.int16(pixels[m + _at(2)] - pixels[m])
-        down = np.int16(pixels[n + _at(1)] - pixels[_at(k + 1)])
-        corners_x, corners_y = np.int16(falling + rising), np.int16(falling - rising)
-        dx[_at(k)] = np.int16(np.int16(three * corners_x) + np.int16(ten * right))
-        dy[_at(k)] = np.int16(np.int16(three * corners_y) + np.int16(ten * down))
+        dx[_at(k)], dy[_at(k)] = _scharr(pixels, k)
+
+
+@compiled()
+def _blend_slopes(values: _Window, weights: _Weights, used: _Window, out: _Window) -> None:
+    """Bilinear interpolation between four derivatives each; zero where `used` is."""
+    a, b, c, d = weights
+    half = np.int32(1 << (_WEIGHT_BITS - 1))
+    for k in range(_LENGTH):
+        m, n = _at(k), _at(k + _STRIDE)
+        upper = np.int32(a * values[m]) + np.int32(b * values[m + _at(1)])
+        lower = np.int32(c * values[n]) + np.int32(d * values[n + _at(1)])
+        out[m] = _i16(np.int32(upper + lower + half) >> _WEIGHT_BITS) & used[m]
 
 
 @compiled()
@@ -139,21 +214,16 @@ def _clear_outside(values: _Window, u: int, v: int, image: _Image) -> None:
 
 
 @compiled()
-def _sums(
-    values: _Window, less: _Window, gx: _Window, gy: _Window
-) -> tuple[np.float32, np.float32]:
-    """Sums of (values - less) times two other windows."""
-    total_x = total_y = np.int64(0)
+def _sum(values: _Window, others: _Window) -> np.int64:
+    """The sum of products; one for each call, as the compiler then has an instruction for it."""
+    total = np.int64(0)
     for start in range(0, _LENGTH, _BLOCK):
-        x = y = np.int32(0)
+        part = np.int32(0)
         for k in range(_BLOCK):
             m = _at(start + k)
-            difference = np.int32(np.int16(values[m] - less[m]))
-            x = np.int32(x + difference * np.int32(gx[m]))
-            y = np.int32(y + difference * np.int32(gy[m]))
-        total_x += x
-        total_y += y
-    return np.float32(total_x) * _SCALE, np.float32(total_y) * _SCALE
+            part = np.int32(part + np.int32(np.int32(values[m]) * np.int32(others[m])))
+        total += part
+    return total
 
 
 @compiled()
@@ -187,7 +257,7 @@ def _track_level(
     pixels, dx, dy = np.zeros(size, np.int16), np.zeros(size, np.int16), np.zeros(size, np.int16)
     grey, moved = np.zeros(_LENGTH, np.int16), np.zeros(_LENGTH, np.int16)
     gx, gy = np.zeros(_LENGTH, np.int16), np.zeros(_LENGTH, np.int16)
-    used, zero = np.zeros(_LENGTH, np.int16), np.zeros(_LENGTH, np.int16)
+    used = np.zeros(_LENGTH, np.int16)
     for row in range(WINDOW_PX):
         used[row * _STRIDE : row * _STRIDE + WINDOW_PX] = -1  # all bits
     for i in range(len(points)):
@@ -197,17 +267,19 @@ def _track_level(
             good[i] &= level > 0
             continue
         _copy(source, u - 1, v - 1, _STRIDE, pixels)
-        _blend(pixels, _STRIDE + 1, weights, _IMAGE_BITS, grey)
-        _differentiate(pixels, dx, dy)
+        _blend_in_halves(pixels, weights, dx, dy)
+        _middle(dx, dy, grey)
         if u < 0 or v < 0 or u + WINDOW_PX >= source.shape[1] or v + WINDOW_PX >= source.shape[0]:
+            _differentiate(pixels, dx, dy)
             _clear_outside(dx, u, v, source)
             _clear_outside(dy, u, v, source)
-        _blend(dx, 0, weights, _WEIGHT_BITS, gx)
-        _blend(dy, 0, weights, _WEIGHT_BITS, gy)
-        for k in range(_LENGTH):
-            gx[_at(k)] &= used[_at(k)]
-            gy[_at(k)] &= used[_at(k)]
-        (xx, xy), (_, yy) = _sums(gx, zero, gx, gy), _sums(gy, zero, gx, gy)
+            _blend_slopes(dx, weights, used, gx)
+            _blend_slopes(dy, weights, used, gy)
+        else:
+            _slopes(dx, dy, used, gx, gy)
+        own_x, own_y = _sum(grey, gx), _sum(grey, gy)
+        xx, xy = np.float32(_sum(gx, gx)) * _SCALE, np.float32(_sum(gx, gy)) * _SCALE
+        yy = np.float32(_sum(gy, gy)) * _SCALE
         determinant = xx * yy - xy * xy
         root = np.sqrt((xx - yy) * (xx - yy) + np.float32(4.0) * xy * xy)
         eigenvalue = (yy + xx - root) / np.float32(2 * WINDOW_PX * WINDOW_PX)
@@ -222,8 +294,9 @@ def _track_level(
             if _outside(u, v, target):
                 break
             _copy(target, u, v, WINDOW_PX + 1, pixels)
-            _blend(pixels, 0, weights, _IMAGE_BITS, moved)
-            bx, by = _sums(moved, grey, gx, gy)
+            _blend(pixels, weights, moved)
+            bx = np.float32(_sum(moved, gx) - own_x) * _SCALE
+            by = np.float32(_sum(moved, gy) - own_y) * _SCALE
             step_x, step_y = (xy * by - yy * bx) * inverse, (xy * bx - xx * by) * inverse
             x += step_x
             y += step_y
