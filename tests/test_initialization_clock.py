@@ -120,10 +120,12 @@ def test_sigma_of_the_offset_covers_its_error() -> None:
     assert abs(found.offset_s - 0.03) < 3 * found.offset_sigma_s < 0.01
 
 
-def recorded(offset_s: float, cameras: int, seconds: float, seed: int = 2) -> list[Packet]:
+def recorded(
+    offset_s: float, cameras: int, seconds: float, seed: int = 2, points: int = 300
+) -> list[Packet]:
     """A flight; no frame comes with a later IMU sample than its own stamp."""
     rng = np.random.default_rng(seed)
-    whole = list(packets(Flight(), rig(cameras), 0.5 * room(300, rng), seconds, rng, 20.0))
+    whole = list(packets(Flight(), rig(cameras), 0.5 * room(points, rng), seconds, rng, 20.0))
     imu = ImuData.concatenate([packet.imu for packet in whole])
     late_ns, begin, found = round(offset_s * 1e9), 0, []
     for packet in whole:
@@ -180,10 +182,9 @@ def test_an_unknown_offset_is_found_in_the_start(offset_s: float, cameras: int) 
 @pytest.mark.parametrize("known", [True, False])
 def test_features_that_are_known_to_move_do_not_bend_the_clock(known: bool) -> None:
     """Most features are on a body that turns as the world would under a clock 50 ms off."""
-    static = np.arange(100)
+    static = np.arange(300)
     check, imu, found = StartCalibration(rig(1), BackendConfig()), ImuBuffer(), []
-    flown = recorded(0.0, 1, 5.0)
-    for before, packet in pairwise(flown):
+    for before, packet in pairwise(recorded(0.0, 1, 6.0, points=1500)):
         assert isinstance(packet.frame, FeatureFrame)
         assert isinstance(before.frame, FeatureFrame)
         world, body = packet.frame.only(static).cameras[0], before.frame.without(static).cameras[0]
@@ -197,7 +198,6 @@ def test_features_that_are_known_to_move_do_not_bend_the_clock(known: bool) -> N
         frame = FeatureFrame(packet.frame.stamp_ns, (seen,))
         found.append(check.add(frame, imu, started=True, dynamic=dynamic))
     adopted = [one for one in found if isinstance(one, FoundCalibration)]
-    assert check.done
     assert bool(adopted) != known
     for one in adopted:
         assert abs(one.rig.cameras[0].time_offset_s + 0.05) < 0.01
