@@ -20,9 +20,11 @@ from slam_graph.datasets.faults.injection import inject
 from slam_graph.datasets.memory_sequence import dataset_from_arrays
 from slam_graph.datasets.sequence import RecordedSequence
 from slam_graph.diagnosis import Diagnosis, run_evidence
+from slam_graph.diagnostics import Diagnostics
 from slam_graph.pipeline import clock_watch, recovery, verdict
 from slam_graph.pipeline.run_recording import run
-from slam_graph.sensors.measurements import FeatureFrame
+from slam_graph.pipeline.stage import EstimatedFrame
+from slam_graph.sensors.measurements import FeatureFrame, FeatureObservations
 from slam_graph.sensors.rig import Rig, RigCamera
 from slam_graph.simulation.simulator import simulate
 
@@ -343,3 +345,27 @@ def test_what_follows_the_loss_that_ends_a_run_is_not_compared(
     assert seconds[0] < jump_s < seconds[1]
     assert seconds[1] == pytest.approx(result.logs.frames / 20.0, abs=0.06), "the last frame"
     assert "slam-graph doctor says" not in result.message
+
+
+@pytest.mark.parametrize(("all_used", "status"), [(True, "suspect"), (False, "ok")])
+def test_what_the_estimator_used_must_show_a_fault_as_well(all_used: bool, status: str) -> None:
+    """Most features are on a body that looks like the world to a camera that is turned by 8°."""
+    flight = simulate(trajectory="random", duration_s=12.0, rate_hz=10.0, seed=1)
+    result = run(flight, algorithm="msckf", overrides=CAUSAL)
+    assert result.status == "ok"
+    judged, none = verdict.Verdict(result, Diagnostics()), np.zeros(0, np.int64)
+    camera, turn = flight.rig.cameras[0].camera, gtsam.Rot3.Rx(np.deg2rad(8.0)).matrix()
+    for packet in flight.packets():
+        assert isinstance(packet.frame, FeatureFrame)
+        seen = packet.frame.cameras[0]
+        on_body = seen.ids % 10 > 3
+        rays = np.column_stack([seen.normalized, np.ones(len(seen))])
+        rays[on_body] = rays[on_body] @ turn.T
+        normalized = rays[:, :2] / rays[:, 2:]
+        moved = FeatureObservations(seen.ids, camera.distort(normalized)[0], normalized)
+        frame = FeatureFrame(packet.frame.stamp_ns, (moved,))
+        used = seen.ids if all_used else seen.ids[~on_body]
+        places = np.zeros((len(used), 3))
+        judged.frame(EstimatedFrame(packet, frame, None, used, places, none, (1.0, 1.0), True))
+    judged.finish()
+    assert result.status == status, result.message

@@ -241,6 +241,7 @@ class Verdict(Stage):
             clocks: a change of the time offset, if there is one.
         """
         found = self._diagnosed(self._result.input.rig if failed else self._final_rig())
+        certain = failed or clocks is not None or not found.setup_faults or self._is_confirmed()
         if clocks is not None:
             found = found.with_clocks(clocks)
         ending, guess = self._result.ending, found.best_guess()
@@ -250,7 +251,7 @@ class Verdict(Stage):
                 guess = found.certain_errors[0].with_fix
                 ending.message = ending.message.removesuffix(ending.waiting_for)
             ending.message += f"; slam-graph doctor says: {guess}"
-        elif faults and not failed and self._is_confirmed():
+        elif faults and certain and not failed:
             likely = "; or ".join(finding.what for finding in faults[:2])
             self._suspect(f"{likely}; see `slam-graph doctor`")
         elif contradictions and not failed:
@@ -265,10 +266,11 @@ class Verdict(Stage):
 
         A board that moves before the camera looks like another mounting, focal length or clock.
         """
-        frames = self._kept.used_frames
-        if not frames:
-            return True
-        return bool(self._of_tracks(self._final_rig(), frames, self._kept.imu).setup_faults)
+        with warn_on_failure(self._diagnostics, "diagnosis_failed", "faults are not confirmed"):
+            frames = self._kept.used_frames
+            used = self._of_tracks(self._final_rig(), frames, self._kept.imu) if frames else None
+            return used is None or bool(used.setup_faults)
+        return True
 
     def _suspect(self, why: str) -> None:
         """Say that the estimate may be wrong, and why."""

@@ -255,7 +255,7 @@ class FeatureFrame:
     @property
     def ids(self) -> IntArray:
         """The features (N,) that any camera sees, ascending."""
-        ids = np.sort(np.concatenate([camera.ids for camera in self.cameras]))
+        ids = np.sort(np.concatenate([np.zeros(0, np.int64), *(c.ids for c in self.cameras)]))
         new = np.empty(len(ids), np.bool_)
         new[:1] = True
         np.not_equal(ids[1:], ids[:-1], out=new[1:])

@@ -93,6 +93,7 @@ class StartCalibration:
         self._camera = rig.cameras[0]
         self.mounted = self._camera.rotation_known
         self.recent: deque[FeatureFrame] = deque()
+        self._static: deque[FeatureFrame] = deque()  # the same without what is known to move
         self._turns = VisualTurns(self._camera, config.noise.pixel_sigma)
         self._next_ns, self._pause_ns, self._doubted_ns = 0, _LATER_PAUSE_NS, 0
         self._checks = config.initialization.check_calibration
@@ -104,6 +105,7 @@ class StartCalibration:
         """Forget all frames: those that follow do not continue them."""
         self._turns.forget()
         self.recent.clear()
+        self._static.clear()
 
     def add(
         self, frame: FeatureFrame, imu: ImuBuffer, started: bool, dynamic: IntArray
@@ -114,7 +116,8 @@ class StartCalibration:
             frame: its features.
             imu: samples so far.
             started: whether there is a state already.
-            dynamic: ids (D,) of the features that move by themselves, which are left out.
+            dynamic: ids (D,) of the features that are known so far to move by themselves, which are
+                left out.
 
         Returns:
             A calibration that the old one contradicts, or a change of the clock since then; None as
@@ -123,10 +126,12 @@ class StartCalibration:
         if self.done and not self._checks:
             return None
         self.recent.append(frame)
+        frame = frame.without(dynamic)
+        self._static.append(frame)
         while frame.stamp_ns - self.recent[0].stamp_ns > _RECENT_NS:
             self.recent.popleft()
+            self._static.popleft()
         monitor = self._monitor if started else None
-        frame = frame.without(dynamic)
         if self.done:
             return self._watch(frame, imu, monitor)
         self._turns.add(frame, imu, self.mounted, _SPACING_NS)
@@ -181,7 +186,7 @@ class StartCalibration:
         if self._monitor is None or not self._checks:
             return None
         turns = VisualTurns(self._camera, self._config.noise.pixel_sigma)
-        for frame in self.recent:
+        for frame in self._static:
             turns.add(frame, imu, self.mounted, _SPACING_NS)
         covered = turns.covered(imu)
         return None if covered is None else self._monitor.estimate(covered, imu)

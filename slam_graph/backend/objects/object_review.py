@@ -5,10 +5,11 @@
 Two things go wrong that the residuals of an estimator hardly show. Two bodies of which one comes
 nearer while the other goes away fit one body that turns. And a few points on a plane that faces the
 cameras fit two motions, mirror images of one another (Necker's cube), of which an estimator that
-began with the wrong one does not find the other. So from time to time the tracks of the last frames
-are estimated anew: all of them, and each half. Twice the logarithm of the likelihood ratio, the
-difference of the squared errors, has a χ² distribution of as many degrees of freedom as there are
-further unknowns, if nothing is wrong (Wilks 1938).
+began with the wrong one does not find the other. So from time to time, where an object fits its
+tracks worse than one body would, those of the last frames are estimated anew: all of them, and each
+half. Twice the logarithm of the likelihood ratio, the difference of the squared errors, has a χ²
+distribution of as many degrees of freedom as there are further unknowns, if nothing is wrong (Wilks
+1938).
 """
 
 from __future__ import annotations
@@ -29,8 +30,9 @@ from slam_graph.backend.objects.track_window import TrackWindow
 from slam_graph.backend.objects.tracked_object import TrackedObject
 from slam_graph.backend.policies import AlgorithmConfig
 
-_LEAST_FRAMES = 3
-"""Frames of a window that tell anything."""
+_LEAST_FRAMES, _FULL = 3, 0.75
+"""Frames of a window that tell anything, after the first one; and the part of the window that they
+must span: over less too many motions fit. Stamps may be uneven."""
 _UNLIKE_ONE = 1.2
 """An object is reviewed where its squared errors are so many times those that one body has in five
 of six frames: estimating its tracks anew costs most."""
@@ -83,8 +85,8 @@ class ObjectReview:
         anew = self._begun(item.members)
         if anew is None:
             return []
-        stamps = [stamp for stamp in anew.motion.poses if stamp in item.poses]
-        if not self._fill_the_window(stamps):
+        stamps = self._window.stamps_ns[1:]  # the new one begins with the first frame
+        if not all(stamp in anew.motion.poses for stamp in stamps):
             return []
         current = self._total(item.members, item, stamps)
         best, part = self._total(item.members, anew.motion, stamps), anew
@@ -108,28 +110,18 @@ class ObjectReview:
 
     def _is_one_body(self, item: TrackedObject) -> bool:
         """Whether the errors of an object are those of one body, or it is too young to say."""
-        stamps = [stamp for stamp in self._window.stamps_ns if stamp in item.poses]
-        # an estimate that begins anew has no pose in the first frame of the window
-        if not self._fill_the_window(stamps[1:]):
+        stamps = self._window.stamps_ns
+        lasts = len(stamps) > _LEAST_FRAMES
+        lasts &= stamps[-1] - stamps[0] > _FULL * self._config.window_s * 1e9
+        if not (lasts and all(stamp in item.poses for stamp in stamps)):
             return True
         expected = _UNLIKE_ONE * self._expected(item.members, stamps)
         return self._total(item.members, item, stamps) <= expected
 
-    def _fill_the_window(self, stamps: list[int]) -> bool:
-        """Whether a motion is known from the second frame of the window on, up to its last one.
-
-        Over less too many motions fit.
-        """
-        if len(stamps) < _LEAST_FRAMES:
-            return False
-        period = (stamps[-1] - stamps[0]) / (len(stamps) - 1)
-        return (len(stamps) + 1) * period > self._config.window_s * 1e9
-
     def _expected(self, members: IntArray, stamps: list[int]) -> float:
         """Sum of the squared errors of one body; larger ones are found in one of six frames."""
-        length = np.isin(self._window.stamps_ns, stamps)
         obs = self._window.observations(members, 3, stamps)
-        dof = float(np.sum(2 * obs.counts - 3)) - 6 * (np.count_nonzero(length) - 1)
+        dof = max(float(np.sum(2 * obs.counts - 3)) - 6 * (len(stamps) - 1), 0.0)
         return dof + float(np.sqrt(2.0 * max(dof, 1.0)))
 
     def _halves(self, members: IntArray, least: int) -> list[Part]:
