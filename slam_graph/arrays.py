@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""Array types that all modules share, tables that grow, cross products as matrices, and medians."""
+"""Array types of all modules, tables that grow, sets of ids, cross products, and medians."""
 
 from __future__ import annotations
 
@@ -15,8 +15,11 @@ __all__ = [
     "FloatArray",
     "GrowingTable",
     "IntArray",
+    "ascending_union",
     "median",
+    "one_of_ascending",
     "skew",
+    "sorted_unique",
 ]
 
 FloatArray = NDArray[np.float64]
@@ -73,6 +76,33 @@ class GrowingTable:
         if not self._blocks:
             return np.empty((0, self._width), self._dtype)
         return np.concatenate(self._blocks)[: self._count]
+
+
+def one_of_ascending(values: IntArray, ascending: IntArray) -> BoolArray:
+    """Which values (N,) are among some ascending ones (M,); NumPy's `isin` takes far longer.
+
+    `kernels.ascending.are_among` is faster, but has to load Numba.
+    """
+    if len(ascending) == 0:
+        return np.zeros(len(values), np.bool_)
+    places = np.minimum(ascending.searchsorted(values), len(ascending) - 1)
+    return np.asarray(ascending[places] == values)
+
+
+def sorted_unique(values: IntArray) -> IntArray:
+    """The distinct values of an ascending array (N,)."""
+    first = np.empty(len(values), np.bool_)
+    first[:1] = True
+    np.not_equal(values[1:], values[:-1], out=first[1:])
+    return values[first]
+
+
+def ascending_union(*parts: IntArray) -> IntArray:
+    """The distinct values of some arrays, ascending; NumPy's functions take twice as long."""
+    some = [part for part in parts if len(part)]
+    if not some:
+        return np.zeros(0, np.int64)
+    return sorted_unique(np.sort(np.concatenate(some) if len(some) > 1 else some[0]))
 
 
 def skew(v: FloatArray) -> FloatArray:

@@ -7,12 +7,12 @@ Here pyramids are given, and derivatives are taken where they are needed. Positi
 bits and windows of whole numbers are those of OpenCV; the sums over a window are exact, while
 OpenCV's are rounded in an order that depends on the machine.
 
-A window is a flat array, in rows of `_STRIDE` numbers of which the last three are not used: a loop
-over all of it is made of vectors, if the compiler knows the _STRIDE. `np.int32(…)` around a product
-keeps Numba from computing in 64 bits, which would double their number; in 16 bits it is halved. A
-weight of 14 bits is 64 h + l, and four of them sum up to 2^14, so the sum of their products with
-grey values v is S = 64 H + L, where H = Σ h v and L = Σ l v are below 2^16. Derivatives have five
-bits more, so for them S is 2048 A + B: those of A and those of B fit into 16 bits with their sign.
+A window is a flat array, in rows of `_STRIDE` numbers, the last three not used: a loop over all of
+it is made of vectors, if the compiler knows the _STRIDE. `np.int32(…)` around a product keeps Numba
+from 64 bits; vectors of 16 bits take half the instructions of those of 32. A weight of 14 bits is
+64 h + l, and four of them sum up to 2^14, so the sum of their products with grey values v is S = 64
+H + L, where H = Σ h v and L = Σ l v are below 2^16. For derivatives, which have five bits more, S
+is 2048 A + B with 0 ≤ B < 2048: Scharr's sums of A and of B each fit into 16 bits with their sign.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ _OSCILLATION_PX = 0.01
 """Two steps that cancel to within this end the iteration, half way between their ends."""
 
 _BLOCK = 64
-"""So many products are added in 32 bits: 64 * 4080 * 8160, derivative times grey, is below 2^31."""
+"""So many products are added in 32 bits: 64 * 4081 * 8160, derivative times grey, is below 2^31."""
 
 _LENGTH = -(-WINDOW_PX * _STRIDE // _BLOCK) * _BLOCK
 """Of a window, made up to whole blocks."""

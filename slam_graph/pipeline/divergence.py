@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from slam_graph.arrays import IntArray
+from slam_graph.arrays import IntArray, one_of_ascending
 from slam_graph.config import RunConfig
 from slam_graph.errors import EstimationError
 from slam_graph.geometry import NavState
@@ -153,7 +153,11 @@ class Disagreement:
             )
 
     def _forget_recent(self, begin_s: float) -> None:
-        """Let the share begin with the last test that is not later than a time, of tests so far."""
+        """Forget the tests before the one that was under way at a time.
+
+        Args:
+            begin_s: seconds in which features were tested, since the first test.
+        """
         recent = self._recent
         while len(recent) > 1 and recent[1].tested_s <= begin_s:
             old = recent.popleft()
@@ -206,8 +210,7 @@ class Corrections:
         ids = frame.ids
         if not len(ids):
             return
-        places = np.minimum(ids.searchsorted(self._ids), len(ids) - 1)
-        if np.count_nonzero(ids[places] == self._ids) < _FOUND_AGAIN * len(self._ids):
+        if np.count_nonzero(one_of_ascending(self._ids, ids)) < _FOUND_AGAIN * len(self._ids):
             self._broken_ns = frame.stamp_ns
         self._ids = ids
 

@@ -15,7 +15,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from slam_graph.arrays import BoolArray, FloatArray, IntArray
+from slam_graph.arrays import BoolArray, FloatArray, IntArray, ascending_union, one_of_ascending
 from slam_graph.sensors.aiding import AidingData
 
 _LONGEST_STEP_S = 0.02
@@ -255,11 +255,7 @@ class FeatureFrame:
     @property
     def ids(self) -> IntArray:
         """The features (N,) that any camera sees, ascending."""
-        ids = np.sort(np.concatenate([np.zeros(0, np.int64), *(c.ids for c in self.cameras)]))
-        new = np.empty(len(ids), np.bool_)
-        new[:1] = True
-        np.not_equal(ids[1:], ids[:-1], out=new[1:])
-        return ids[new]
+        return ascending_union(*(camera.ids for camera in self.cameras))
 
     @property
     def whole(self) -> FeatureFrame:
@@ -272,7 +268,7 @@ class FeatureFrame:
     def only(self, ids: IntArray) -> FeatureFrame:
         """The frame with these features only."""
         ascending = np.sort(ids)
-        cameras = (c.select(_are_among(c.ids, ascending)) for c in self.cameras)
+        cameras = (c.select(one_of_ascending(c.ids, ascending)) for c in self.cameras)
         return FeatureFrame(self.stamp_ns, tuple(cameras))
 
     def usable(self, cameras: int) -> tuple[FeatureFrame, int]:
@@ -300,16 +296,8 @@ class FeatureFrame:
         if len(ids) == 0:
             return self
         ascending = np.sort(ids)
-        cameras = (c.left_out(_are_among(c.ids, ascending)) for c in self.cameras)
+        cameras = (c.left_out(one_of_ascending(c.ids, ascending)) for c in self.cameras)
         return FeatureFrame(self.stamp_ns, tuple(cameras))
-
-
-def _are_among(ids: IntArray, ascending: IntArray) -> BoolArray:
-    """Which ids (N,) are among some ascending ones; NumPy's `isin` takes far longer."""
-    if not len(ascending):
-        return np.zeros(len(ids), np.bool_)
-    places = np.minimum(ascending.searchsorted(ids), len(ascending) - 1)
-    return np.asarray(ascending[places] == ids)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -17,7 +17,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from gtsam.symbol_shorthand import L
 
-from slam_graph.arrays import BoolArray, IntArray
+from slam_graph.arrays import BoolArray, IntArray, ascending_union, sorted_unique
 from slam_graph.backend.backend_config import BackendConfig
 from slam_graph.backend.cost.consensus_gate import gate_by_consensus
 from slam_graph.backend.cost.cost import Cost, Linearization, TrackFeatures
@@ -27,9 +27,7 @@ from slam_graph.backend.cost.feature_tracks import (
     Observations,
     Outcome,
     Removals,
-    ascending_union,
     is_in,
-    sorted_unique,
 )
 from slam_graph.backend.cost.gating import Gate, Innovations, threshold
 from slam_graph.backend.cost.pixel_noise import PixelNoise

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from gtsam.symbol_shorthand import X
 
-from slam_graph.arrays import BoolArray, FloatArray, IntArray
+from slam_graph.arrays import BoolArray, FloatArray, IntArray, ascending_union
 from slam_graph.backend.backend_config import BackendConfig
 from slam_graph.backend.cost.cost import TrackFeatures
 from slam_graph.backend.cost.feature_tracks import (
@@ -22,7 +22,6 @@ from slam_graph.backend.cost.feature_tracks import (
     Observations,
     Outcome,
     Removals,
-    ascending_union,
     is_in,
 )
 from slam_graph.backend.cost.pixel_noise import PixelNoise

@@ -16,7 +16,7 @@ from enum import StrEnum
 import numpy as np
 from numpy.typing import NDArray
 
-from slam_graph.arrays import BoolArray, FloatArray, IntArray
+from slam_graph.arrays import BoolArray, FloatArray, IntArray, ascending_union, sorted_unique
 from slam_graph.kernels.ascending import are_among
 from slam_graph.sensors import FeatureFrame
 
@@ -382,19 +382,3 @@ def is_in(values: IntArray, ascending: IntArray) -> NDArray[np.bool_]:
         return are_among(values, ascending)
     except TypeError:  # arrays that cannot be written to, or of other integers
         return are_among(np.array(values, np.int64), np.array(ascending, np.int64))
-
-
-def sorted_unique(values: IntArray) -> IntArray:
-    """The distinct values of an ascending array."""
-    first = np.empty(len(values), np.bool_)
-    first[:1] = True
-    np.not_equal(values[1:], values[:-1], out=first[1:])
-    return values[first]
-
-
-def ascending_union(*parts: IntArray) -> IntArray:
-    """The distinct values of some arrays, ascending; NumPy's functions take twice as long."""
-    some = [part for part in parts if len(part)]
-    if not some:
-        return np.zeros(0, np.int64)
-    return sorted_unique(np.sort(np.concatenate(some) if len(some) > 1 else some[0]))

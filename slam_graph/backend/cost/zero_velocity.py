@@ -22,9 +22,9 @@ import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import V, X
 
-from slam_graph.arrays import FloatArray, IntArray, median
+from slam_graph.arrays import FloatArray, IntArray, ascending_union, median
 from slam_graph.backend.backend_config import ZeroVelocityConfig
-from slam_graph.backend.cost.feature_tracks import ascending_union, is_in
+from slam_graph.backend.cost.feature_tracks import is_in
 from slam_graph.sensors import FeatureFrame, FeatureObservations, ImuBuffer, ImuData
 
 _DYNAMIC_RATIO = 3.0

@@ -19,12 +19,12 @@ import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import L, V, X
 
-from slam_graph.arrays import BoolArray, FloatArray, IntArray
+from slam_graph.arrays import BoolArray, FloatArray, IntArray, sorted_unique
 from slam_graph.backend.backend_config import PriorConfig, UnknownScale
 from slam_graph.backend.cost.adaptive_imu_noise import MotionChange
 from slam_graph.backend.cost.cost import Cost, Linearization, TrackFeatures
 from slam_graph.backend.cost.feature_factors import SummedFeatures
-from slam_graph.backend.cost.feature_tracks import Observations, is_in, sorted_unique
+from slam_graph.backend.cost.feature_tracks import Observations, is_in
 from slam_graph.backend.cost.imu_factor import IMU_GAP_SCALE, imu_factor
 from slam_graph.backend.cost.robust_loss import RobustLoss
 from slam_graph.backend.cost.triangulation import Triangulation, triangulate

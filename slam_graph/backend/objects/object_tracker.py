@@ -12,9 +12,9 @@ from __future__ import annotations
 import gtsam
 import numpy as np
 
-from slam_graph.arrays import FloatArray, IntArray
+from slam_graph.arrays import FloatArray, IntArray, ascending_union
 from slam_graph.backend.backend_config import BackendConfig
-from slam_graph.backend.cost.feature_tracks import ascending_union, is_in
+from slam_graph.backend.cost.feature_tracks import is_in
 from slam_graph.backend.objects.ego_motion import EgoMotion
 from slam_graph.backend.objects.mirror_motion import MirrorMotion
 from slam_graph.backend.objects.motion_segmentation import rigid_groups

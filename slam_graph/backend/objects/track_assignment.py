@@ -13,8 +13,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from slam_graph.arrays import BoolArray, FloatArray, IntArray
-from slam_graph.backend.cost.feature_tracks import ascending_union, is_in
+from slam_graph.arrays import BoolArray, FloatArray, IntArray, ascending_union
+from slam_graph.backend.cost.feature_tracks import is_in
 from slam_graph.backend.cost.gating import threshold
 from slam_graph.backend.objects.ego_motion import EgoMotion
 from slam_graph.backend.objects.motion_test import MotionTest, Verdict
