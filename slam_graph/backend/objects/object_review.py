@@ -5,11 +5,10 @@
 Two things go wrong that the residuals of an estimator hardly show. Two bodies of which one comes
 nearer while the other goes away fit one body that turns. And a few points on a plane that faces the
 cameras fit two motions, mirror images of one another (Necker's cube), of which an estimator that
-began with the wrong one does not find the other. So from time to time, where an object fits its
-tracks worse than one body would, those of the last frames are estimated anew: all of them, and each
-half. Twice the logarithm of the likelihood ratio, the difference of the squared errors, has a χ²
-distribution of as many degrees of freedom as there are further unknowns, if nothing is wrong (Wilks
-1938).
+began with the wrong one does not find the other. So from time to time the tracks of the last frames
+are estimated anew: all of them, and each half. Twice the logarithm of the likelihood ratio, the
+difference of the squared errors, has a χ² distribution of as many degrees of freedom as there are
+further unknowns, if nothing is wrong (Wilks 1938).
 """
 
 from __future__ import annotations
@@ -30,12 +29,10 @@ from slam_graph.backend.objects.track_window import TrackWindow
 from slam_graph.backend.objects.tracked_object import TrackedObject
 from slam_graph.backend.policies import AlgorithmConfig
 
-_LEAST_FRAMES, _FULL = 3, 0.75
-"""Frames of a window that tell anything, after the first one; and the part of the window that they
-must span: over less too many motions fit. Stamps may be uneven."""
-_UNLIKE_ONE = 1.2
-"""An object is reviewed where its squared errors are so many times those that one body has in five
-of six frames: estimating its tracks anew costs most."""
+_LEAST_FRAMES = 3
+"""Frames of a window that tell anything."""
+_AGAIN = 0.01
+"""Probability with which an object begins again without need; what it loses is its past."""
 _LABEL = 2.0 * float(np.log(2.0))
 """What it costs that a track may be of either half: both are as likely."""
 _ROUNDS = 2
@@ -80,13 +77,15 @@ class ObjectReview:
     def of(self, item: TrackedObject) -> list[Part]:
         """What an object is: nothing if it is as it is known, one part to begin again, or two."""
         least = self._config.min_points
-        if self._is_one_body(item):
+        # an estimate that begins anew, which costs most, has no pose in the first frame of the
+        # window; where the others cannot fill it, it is not made
+        if not self._fill_the_window([s for s in self._window.stamps_ns[1:] if s in item.poses]):
             return []
         anew = self._begun(item.members)
         if anew is None:
             return []
-        stamps = self._window.stamps_ns[1:]  # the new one begins with the first frame
-        if not all(stamp in anew.motion.poses for stamp in stamps):
+        stamps = [stamp for stamp in anew.motion.poses if stamp in item.poses]
+        if not self._fill_the_window(stamps):
             return []
         current = self._total(item.members, item, stamps)
         best, part = self._total(item.members, anew.motion, stamps), anew
@@ -106,22 +105,21 @@ class ObjectReview:
             apart = sum(self._total(half.members, half.motion, stamps) for half in halves)
             if min(current, best) - apart > limit + _LABEL * len(item.members):
                 return halves
-        return [Part(item.members, part.motion)] if current - best > limit else []
+        again = float(chdtri(6 * (len(stamps) - 1), _AGAIN))
+        return [Part(item.members, part.motion)] if current - best > again else []
 
-    def _is_one_body(self, item: TrackedObject) -> bool:
-        """Whether the errors of an object are those of one body, or it is too young to say."""
-        stamps = self._window.stamps_ns
-        lasts = len(stamps) > _LEAST_FRAMES
-        lasts &= stamps[-1] - stamps[0] > _FULL * self._config.window_s * 1e9
-        if not (lasts and all(stamp in item.poses for stamp in stamps)):
-            return True
-        expected = _UNLIKE_ONE * self._expected(item.members, stamps)
-        return self._total(item.members, item, stamps) <= expected
+    def _fill_the_window(self, stamps: list[int]) -> bool:
+        """Whether a motion is known over the whole window; earlier too many motions fit."""
+        if len(stamps) < _LEAST_FRAMES:
+            return False
+        period = (stamps[-1] - stamps[0]) / (len(stamps) - 1)
+        return len(stamps) * period > self._config.window_s * 1e9
 
     def _expected(self, members: IntArray, stamps: list[int]) -> float:
         """Sum of the squared errors of one body; larger ones are found in one of six frames."""
+        length = np.isin(self._window.stamps_ns, stamps)
         obs = self._window.observations(members, 3, stamps)
-        dof = max(float(np.sum(2 * obs.counts - 3)) - 6 * (len(stamps) - 1), 0.0)
+        dof = float(np.sum(2 * obs.counts - 3)) - 6 * (np.count_nonzero(length) - 1)
         return dof + float(np.sqrt(2.0 * max(dof, 1.0)))
 
     def _halves(self, members: IntArray, least: int) -> list[Part]:
