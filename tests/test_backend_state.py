@@ -27,7 +27,6 @@ from slam_graph.backend.solve.state import (
     letter_and_index,
 )
 from slam_graph.geometry.trajectory import NavState
-from slam_graph.sensors import FeatureFrame, FeatureObservations, ImuData
 
 KEYS = [L(5), X(0), X(1), V(1), B(1)]
 
@@ -94,28 +93,6 @@ def test_columns_are_in_the_order_of_the_keys() -> None:
     for keys in ([X(1), X(0)], [B(1), L(5), X(0)], [V(1)], []):
         expected = [c for key in keys for c in range(*columns.columns[key].indices(columns.size))]
         assert columns.indices(keys).tolist() == expected
-
-
-def test_features_of_a_frame() -> None:
-    """Their ids, and the frame without some of them."""
-    none = np.zeros((3, 2))
-    cameras = [FeatureObservations(np.array(ids), none, none) for ids in ([7, 2, 9], [9, 3, 2])]
-    frame = FeatureFrame(0, tuple(cameras))
-    assert frame.ids.tolist() == [2, 3, 7, 9]
-    left = frame.without(np.array([11, 7, 3]))
-    assert [camera.ids.tolist() for camera in left.cameras] == [[2, 9], [9, 2]]
-    assert frame.without(np.array([5])).cameras == frame.cameras
-    only = frame.only(np.array([11, 7, 3]))
-    assert [camera.ids.tolist() for camera in only.cameras] == [[7], [3]]
-    assert all(len(camera) == 0 for camera in frame.only(np.zeros(0, np.int64)).cameras)
-
-
-def test_chained_rotations() -> None:
-    """As products one after the other."""
-    turns = [gtsam.Rot3.Rodrigues(0.1 * k, 0.2, 0.3).matrix() for k in range(3)]
-    chained = ImuData.chained(np.array(turns))
-    np.testing.assert_allclose(chained[-1], turns[0] @ turns[1] @ turns[2], atol=1e-15)
-    assert np.array_equal(chained[0], np.eye(3))
 
 
 def test_dimensions() -> None:

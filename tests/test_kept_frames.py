@@ -36,18 +36,18 @@ def test_features_that_were_used_stand_alone_where_they_are_enough(
 
 @pytest.mark.parametrize("field", ["rejected", "dynamic"])
 def test_used_features_that_move_are_left_out(field: str) -> None:
-    kept, moving = _kept(field, 0.3, landmark_ids=True)
+    kept, moving = _kept(field, 0.3, "landmark_ids")
     assert moving
     assert _ids(kept.used_frames) == _ids(kept.frames) - moving != set()
 
 
-def _kept(field: str, part: float, **everywhere: bool) -> tuple[KeptFrames, set[int]]:
+def _kept(field: str, part: float, *everywhere: str) -> tuple[KeptFrames, set[int]]:
     """Frames of a flight with part of the ids in a field, in every third frame; and these ids.
 
     Args:
         field: of the frames.
         part: of the ids.
-        everywhere: fields with all ids.
+        everywhere: names of fields with all ids.
     """
     flight = simulate(duration_s=3.0, seed=1, rate_hz=20.0)
     kept, none, chosen = KeptFrames(True, NoObjects()), np.zeros(0, np.int64), set[int]()

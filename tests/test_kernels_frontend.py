@@ -181,7 +181,7 @@ def test_track_windows(levels: int) -> None:
 
 @pytest.mark.parametrize("side", [1, 2, 5])
 def test_track_windows_of_black_and_white(side: int) -> None:
-    # the largest derivatives, and weights of which one is rounded to -1
+    # the largest derivatives; between small fractions the last of the four weights is -1
     rng = np.random.default_rng(10)
     squares = rng.integers(0, 2, (200 // side, 200 // side), np.uint8) * np.uint8(255)
     image = np.ascontiguousarray(np.kron(squares, np.ones((side, side), np.uint8)))
