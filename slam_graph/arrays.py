@@ -17,9 +17,7 @@ __all__ = [
     "IntArray",
     "ascending_union",
     "median",
-    "one_of_ascending",
     "skew",
-    "sorted_unique",
 ]
 
 FloatArray = NDArray[np.float64]
@@ -78,31 +76,16 @@ class GrowingTable:
         return np.concatenate(self._blocks)[: self._count]
 
 
-def one_of_ascending(values: IntArray, ascending: IntArray) -> BoolArray:
-    """Which values (N,) are among some ascending ones (M,); NumPy's `isin` takes far longer.
-
-    `kernels.ascending.are_among` is faster, but has to load Numba.
-    """
-    if len(ascending) == 0:
-        return np.zeros(len(values), np.bool_)
-    places = np.minimum(ascending.searchsorted(values), len(ascending) - 1)
-    return np.asarray(ascending[places] == values)
-
-
-def sorted_unique(values: IntArray) -> IntArray:
-    """The distinct values of an ascending array (N,)."""
-    first = np.empty(len(values), np.bool_)
-    first[:1] = True
-    np.not_equal(values[1:], values[:-1], out=first[1:])
-    return values[first]
-
-
 def ascending_union(*parts: IntArray) -> IntArray:
     """The distinct values of some arrays, ascending; NumPy's functions take twice as long."""
     some = [part for part in parts if len(part)]
     if not some:
         return np.zeros(0, np.int64)
-    return sorted_unique(np.sort(np.concatenate(some) if len(some) > 1 else some[0]))
+    values = np.sort(np.concatenate(some) if len(some) > 1 else some[0])
+    first = np.empty(len(values), np.bool_)
+    first[:1] = True
+    np.not_equal(values[1:], values[:-1], out=first[1:])
+    return values[first]
 
 
 def skew(v: FloatArray) -> FloatArray:

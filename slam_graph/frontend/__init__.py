@@ -15,7 +15,6 @@ __all__ = [
     "Feedback",
     "Frontend",
     "FrontendConfig",
-    "Image",
     "Keypoints",
     "build_frontend",
     "epipolar_error",
@@ -31,7 +30,7 @@ if TYPE_CHECKING:
         FrontendConfig,
     )
     from slam_graph.frontend.frontend_protocol import Feedback, Frontend, build_frontend
-    from slam_graph.frontend.keypoints import Image, Keypoints
+    from slam_graph.frontend.keypoints import Keypoints
     from slam_graph.frontend.outliers import epipolar_error
 else:
     __getattr__, __dir__ = lazy_exports(
@@ -41,7 +40,7 @@ else:
             "detectors": ("Detector",),
             "frontend_config": ("DESCRIPTORS", "DETECTORS", "FRONTENDS", "FrontendConfig"),
             "frontend_protocol": ("Feedback", "Frontend", "build_frontend"),
-            "keypoints": ("Image", "Keypoints"),
+            "keypoints": ("Keypoints",),
             "outliers": ("epipolar_error",),
         },
     )

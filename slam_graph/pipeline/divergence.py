@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from slam_graph.arrays import IntArray, one_of_ascending
+from slam_graph.arrays import IntArray, ascending_union
 from slam_graph.config import RunConfig
 from slam_graph.errors import EstimationError
 from slam_graph.geometry import NavState
@@ -210,7 +210,8 @@ class Corrections:
         ids = frame.ids
         if not len(ids):
             return
-        if np.count_nonzero(one_of_ascending(self._ids, ids)) < _FOUND_AGAIN * len(self._ids):
+        again = len(self._ids) + len(ids) - len(ascending_union(self._ids, ids))
+        if again < _FOUND_AGAIN * len(self._ids):
             self._broken_ns = frame.stamp_ns
         self._ids = ids
 

@@ -15,7 +15,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from slam_graph.arrays import BoolArray, FloatArray, IntArray, ascending_union, one_of_ascending
+from slam_graph.arrays import BoolArray, FloatArray, IntArray, ascending_union
 from slam_graph.sensors.aiding import AidingData
 
 _LONGEST_STEP_S = 0.02
@@ -268,7 +268,7 @@ class FeatureFrame:
     def only(self, ids: IntArray) -> FeatureFrame:
         """The frame with these features only."""
         ascending = np.sort(ids)
-        cameras = (c.select(one_of_ascending(c.ids, ascending)) for c in self.cameras)
+        cameras = (c.select(_one_of_ascending(c.ids, ascending)) for c in self.cameras)
         return FeatureFrame(self.stamp_ns, tuple(cameras))
 
     def usable(self, cameras: int) -> tuple[FeatureFrame, int]:
@@ -296,7 +296,7 @@ class FeatureFrame:
         if len(ids) == 0:
             return self
         ascending = np.sort(ids)
-        cameras = (c.left_out(one_of_ascending(c.ids, ascending)) for c in self.cameras)
+        cameras = (c.left_out(_one_of_ascending(c.ids, ascending)) for c in self.cameras)
         return FeatureFrame(self.stamp_ns, tuple(cameras))
 
 
@@ -316,3 +316,14 @@ class Packet:
     imu: ImuData
     frame: CameraFrame | FeatureFrame
     aiding: AidingData | None = None
+
+
+def _one_of_ascending(values: IntArray, ascending: IntArray) -> BoolArray:
+    """Which values (N,) are among some ascending ones (M,); NumPy's `isin` takes far longer.
+
+    `kernels.ascending.are_among` is faster, but has to load Numba.
+    """
+    if len(ascending) == 0:
+        return np.zeros(len(values), np.bool_)
+    places = np.minimum(ascending.searchsorted(values), len(ascending) - 1)
+    return np.asarray(ascending[places] == values)

@@ -17,7 +17,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from gtsam.symbol_shorthand import L
 
-from slam_graph.arrays import BoolArray, IntArray, ascending_union, sorted_unique
+from slam_graph.arrays import BoolArray, IntArray, ascending_union
 from slam_graph.backend.backend_config import BackendConfig
 from slam_graph.backend.cost.consensus_gate import gate_by_consensus
 from slam_graph.backend.cost.cost import Cost, Linearization, TrackFeatures
@@ -359,7 +359,7 @@ class CostConstruction:
         """The features that stay in the state: those that are tracked, old and new."""
         ids = np.zeros(0, np.int64)
         if cost.landmarks is not None:
-            ids = sorted_unique(cost.landmarks.ids[cost.landmarks.feature])
+            ids = ascending_union(cost.landmarks.ids[cost.landmarks.feature])
         if self.policy.keep_lost_features:
             ids = window.state_features[is_in(window.state_features, window.tracks.seen)]
         if cost.tracks is not None:

@@ -16,7 +16,7 @@ from enum import StrEnum
 import numpy as np
 from numpy.typing import NDArray
 
-from slam_graph.arrays import BoolArray, FloatArray, IntArray, ascending_union, sorted_unique
+from slam_graph.arrays import BoolArray, FloatArray, IntArray, ascending_union
 from slam_graph.kernels.ascending import are_among
 from slam_graph.sensors import FeatureFrame
 
@@ -212,7 +212,7 @@ class FeatureTracks:
             rows = slice(begin, begin := begin + size)
             numbers[0, rows], numbers[2, rows] = camera.ids, number
             places[0, rows], places[1, rows] = camera.pixels, camera.normalized
-        self.seen = sorted_unique(np.sort(numbers[0, old:]))
+        self.seen = frame.ids
         self.added += sum(new)
         order = np.argsort(numbers[0], kind="stable")
         self._numbers, self._places = numbers.take(order, axis=1), places.take(order, axis=1)
@@ -299,7 +299,7 @@ class FeatureTracks:
 
     def ids_in(self, index: int) -> IntArray:
         """The features that any camera saw in one frame, ascending."""
-        return sorted_unique(self._ids[self._frames == index])
+        return ascending_union(self._ids[self._frames == index])
 
     def parallax(self, before: int, after: int, turns: Sequence[FloatArray]) -> FloatArray:
         """Angles (N,) in rad between the rays to features that one camera sees in two frames.
@@ -330,7 +330,7 @@ class FeatureTracks:
         """The features that any camera saw in some frames, ascending."""
         if len(frames) == 0:
             return np.zeros(0, np.int64)
-        return sorted_unique(self._ids[_is_among(self._frames, frames)])
+        return ascending_union(self._ids[_is_among(self._frames, frames)])
 
     def lengths(self) -> tuple[IntArray, IntArray]:
         """All features with waiting observations (J,), and the number of frames that see each."""

@@ -19,7 +19,7 @@ import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import L, V, X
 
-from slam_graph.arrays import BoolArray, FloatArray, IntArray, sorted_unique
+from slam_graph.arrays import BoolArray, FloatArray, IntArray
 from slam_graph.backend.backend_config import PriorConfig, UnknownScale
 from slam_graph.backend.cost.adaptive_imu_noise import MotionChange
 from slam_graph.backend.cost.cost import Cost, Linearization, TrackFeatures
@@ -281,7 +281,7 @@ class DynamicRefinement:
         """Make variables of the features that the last frame still sees."""
         assert cost.tracks is not None
         tracks, room = cost.tracks, self._context.algorithm.cost.max_state_features
-        seen = sorted_unique(np.sort(np.concatenate([c.ids for c in frames.frames[-1].cameras])))
+        seen = frames.frames[-1].ids
         live = is_in(tracks.obs.ids, seen)
         order = np.argsort(-np.where(live, tracks.obs.counts, 0), kind="stable")[:room]
         chosen = np.zeros(len(live), np.bool_)
