@@ -81,7 +81,8 @@ class Window:
         self._places = np.array([turn @ c.body_T_camera.translation() for c in cameras])
         self._mounts = np.array([turn @ c.body_T_camera.rotation().matrix() for c in cameras])
         self._feature, self._frame, self._camera, self._m = _observations(frames, len(cameras))
-        self.features = int(self._feature.max()) + 1 if len(self._feature) else 0
+        self._first = np.flatnonzero(np.diff(self._feature, prepend=-1))  # row of each feature
+        self.features = len(self._first)
 
     def _integrate(self, gyroscope: Gyroscope, t: FloatArray, bias: FloatArray) -> None:
         """Rotations, and what α and A are made of, at the times of the frames."""
@@ -181,24 +182,21 @@ class Window:
         expected: tuple[FloatArray, float],
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Unknowns (10,), their covariance (10, 10), and features (J, 3), by a Schur complement."""
-        A, B, y = (v * weights.reshape(-1, *[1] * (v.ndim - 1)) / noise for v in (of_f, of_rest, b))
-        J = self.features
-        H_ff, H_fr, g_f = np.zeros((J, 3, 3)), np.zeros((J, 3, 10)), np.zeros((J, 3))
-        np.add.at(H_ff, self._feature, A.transpose(0, 2, 1) @ A)
-        np.add.at(H_fr, self._feature, A.transpose(0, 2, 1) @ B)
-        np.add.at(g_f, self._feature, np.einsum("nij,ni->nj", A, y))
-        H_ff += (_TINY * np.trace(H_ff, axis1=1, axis2=2)[:, None, None] + _TINY) * np.eye(3)
+        rows = np.concatenate([of_f, of_rest, b[..., None]], axis=2)
+        rows *= (weights / noise)[:, None, None]
+        by_feature = np.add.reduceat(rows[..., :3].swapaxes(1, 2) @ rows, self._first, axis=0)
+        H_ff, H_fr = by_feature[..., :3], by_feature[..., 3:]
+        size = np.trace(H_ff, axis1=1, axis2=2)[:, None, None]
+        of_features = np.linalg.solve(H_ff + _TINY * (size + 1.0) * np.eye(3), H_fr)
+        rest = rows[..., 3:].reshape(-1, 11)
+        reduced = rest.T @ rest - H_fr.reshape(-1, 11).T @ of_features.reshape(-1, 11)
         prior = np.diag([0.0] * 3 + [_GRAVITY_SIGMA**-2] * 3 + [_BIAS_SIGMA**-2] * 3)
         prior = np.pad(prior, (0, 1))
         prior[_S, _S] = expected[1] ** -2
         likely = np.concatenate([np.zeros(3), -expected[0], np.zeros(3), [1.0]])
-        inner = np.linalg.solve(H_ff, H_fr)
-        H = np.einsum("nij,nik->jk", B, B) - np.einsum("jia,jib->ab", H_fr, inner) + prior
-        g = np.einsum("nij,ni->j", B, y) - np.einsum("jia,ji->a", inner, g_f) + prior @ likely
-        covariance = np.linalg.inv(H + _TINY * np.eye(10))
-        x = covariance @ g
-        points = np.linalg.solve(H_ff, (g_f - H_fr @ x)[..., None])[..., 0]
-        return x, covariance, points
+        covariance = np.linalg.inv(reduced[:10, :10] + prior + _TINY * np.eye(10))
+        x = covariance @ (reduced[:10, 10] + prior @ likely)
+        return x, covariance, of_features[..., 10] - of_features[..., :10] @ x
 
     def _projected(
         self, points: FloatArray, x: FloatArray, alpha: FloatArray
@@ -221,7 +219,10 @@ def _exponentials(vectors: FloatArray) -> FloatArray:
 def _observations(
     frames: list[FeatureFrame], cameras: int
 ) -> tuple[IntArray, IntArray, IntArray, FloatArray]:
-    """Numbers of feature, frame and camera (N,), and normalised points (N, 2), of long tracks."""
+    """Numbers of feature, frame and camera (N,), and normalised points (N, 2), of long tracks.
+
+    In the order of the features.
+    """
     ids, counts = np.unique(
         np.concatenate([f.cameras[0].ids for f in frames if f.cameras]), return_counts=True
     )
@@ -236,5 +237,7 @@ def _observations(
     numbers = np.concatenate([r[0] for r in rows]) if rows else np.zeros((0, 3), np.int64)
     m = np.concatenate([r[1] for r in rows]) if rows else np.zeros((0, 2))
     good = np.all(np.isfinite(m), axis=1)
-    feature, frame_k, camera = numbers[good].T
-    return feature, frame_k, camera, m[good]
+    numbers, m = numbers[good], m[good]
+    order = np.argsort(numbers[:, 0], kind="stable")
+    feature = np.unique(numbers[order, 0], return_inverse=True)[1]
+    return feature, *numbers[order, 1:].T, m[order]

@@ -24,6 +24,7 @@ from scipy.spatial.transform import Rotation
 from slam_graph.arrays import BoolArray, FloatArray, median, skew
 from slam_graph.diagnosis.frame_pairs import FramePair
 from slam_graph.diagnosis.gyroscope import Gyroscope
+from slam_graph.diagnosis.jackknife import jackknife_covariance
 from slam_graph.diagnosis.kinematics import Kinematics
 from slam_graph.sensors import RigCamera
 
@@ -152,6 +153,7 @@ class RotationProblem:
         rows = self._pixels[..., 1] / camera.camera.height - 0.5
         self._row = np.where(self._there, rows, 0.0)
         self._bearings: dict[float, tuple[FloatArray, FloatArray, BoolArray]] = {}
+        self._turns: dict[float, tuple[FloatArray, FloatArray, FloatArray]] = {}
         self._latest: tuple[Kinematics, _Turned] | None = None
 
     def bearings(self, focal: float) -> tuple[FloatArray, FloatArray, BoolArray]:
@@ -187,27 +189,38 @@ class RotationProblem:
     def _turned_at(self, at: Kinematics) -> _Turned:
         """`_turned` computed anew."""
         f, slopes, _ = self.bearings(at.focal)
-        C, t = at.body_R_camera, self._t + at.offset_s
-        R, rates = np.empty((2, len(self._part), 3, 3)), np.empty((2, len(self._part), 3))
-        for number, gyroscope in enumerate(self._gyroscopes):
-            of = self._part == number
-            for k in range(2):
-                R[k, of] = gyroscope.orientation(t[k, of])
-                rates[k, of] = (gyroscope.rate_at(t[k, of]) - at.bias) / at.scale
+        C, (body, halfway, rates) = at.body_R_camera, self._gyroscope_turns(at.offset_s)
         if at.readout_s != 0.0:
-            seconds = self._row * at.readout_s
+            seconds, rates = self._row * at.readout_s, (rates - at.bias) / at.scale
             f = f + np.cross((rates @ C)[:, :, None, :] * seconds[..., None], f)
-        body = R[0].transpose(0, 2, 1) @ R[1]
-        half = Rotation.from_matrix(body).as_rotvec() * 0.5
-        by_bias = (at.bias * (t[1] - t[0])[:, None])[..., None]
-        drift = Rotation.from_rotvec(-half).as_matrix() @ by_bias
-        body = body @ Rotation.from_rotvec(-drift[..., 0]).as_matrix()
+        by_bias = (at.bias * (self._t[1] - self._t[0])[:, None])[..., None]
+        body = body @ Rotation.from_rotvec(-(halfway @ by_bias)[..., 0]).as_matrix()
         if at.scale != 1.0:
             body = Rotation.from_rotvec(Rotation.from_matrix(body).as_rotvec() / at.scale)
             body = body.as_matrix()
         camera = C.T @ body @ C
         two = f[1] @ camera.transpose(0, 2, 1)
         return _Turned(f[0], two, slopes[0], camera[:, None] @ slopes[1])
+
+    def _gyroscope_turns(self, offset_s: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Rotations (P, 3, 3) from the second body of each pair to the first, by the gyroscope.
+
+        With those from the first body to the one halfway, and rates (2, P, 3) in both frames.
+        """
+        if offset_s not in self._turns:
+            t = self._t + offset_s
+            R, rates = np.empty((*t.shape, 3, 3)), np.empty((*t.shape, 3))
+            for number, gyroscope in enumerate(self._gyroscopes):
+                of = self._part == number
+                for k in range(2):
+                    R[k, of] = gyroscope.orientation(t[k, of])
+                    rates[k, of] = gyroscope.rate_at(t[k, of])
+            body = R[0].transpose(0, 2, 1) @ R[1]
+            half = Rotation.from_matrix(body).as_rotvec() * 0.5
+            if len(self._turns) > 4:
+                self._turns.clear()
+            self._turns[offset_s] = body, Rotation.from_rotvec(-half).as_matrix(), rates
+        return self._turns[offset_s]
 
     def directions(self, at: Kinematics, noise: float) -> FloatArray:
         """Directions (P, 3) of the translations that fit best, robustly."""
@@ -300,7 +313,9 @@ class RotationProblem:
             if np.all(np.abs(change) < precision * _LARGEST):
                 break
         covariance = np.diag(np.full(len(WITH_SCALE), np.inf))
-        covariance[np.ix_(columns, columns)] = _covariance(information, scores, np.diag(weight))
+        covariance[np.ix_(columns, columns)] = jackknife_covariance(
+            information, scores, np.diag(weight)
+        )
         return RotationFit(at, covariance, noise, free)
 
     def _normal_equations(
@@ -351,33 +366,6 @@ def _scales(sizes: FloatArray, there: BoolArray) -> FloatArray:
     middle = np.stack([np.maximum(count - 1, 0) // 2, count // 2], axis=1)
     median = np.take_along_axis(ordered, np.minimum(middle, sizes.shape[1] - 1), axis=1)
     return np.where(count > 0, _SIGMA_OF_MEDIAN * np.mean(median, axis=1), 0.0)
-
-
-def _covariance(information: FloatArray, scores: FloatArray, prior: FloatArray) -> FloatArray:
-    """Covariance (n, n) of the solution by the jackknife: without one block of time after another.
-
-    A block that says most of what is known moves the solution much when it is left out, so that few
-    such blocks do not make it look certain. Not below that of independent errors.
-
-    Args:
-        information: (B, n, n) of the blocks.
-        scores: (B, n) gradients of the blocks at the solution.
-        prior: (n, n) information beside them.
-    """
-    total = information.sum(axis=0) + prior
-    moved = np.linalg.solve(total - information, scores[..., None])[..., 0]
-    count = len(scores)
-    jackknife = moved.T @ moved * (count - 1) / count
-    return _not_below(jackknife, np.asarray(np.linalg.inv(total)))
-
-
-def _not_below(covariance: FloatArray, least: FloatArray) -> FloatArray:
-    """The covariance (n, n) enlarged where it is below another one."""
-    root = np.linalg.cholesky(least)
-    white = np.linalg.solve(root, np.linalg.solve(root, covariance).T)
-    values, axes = np.linalg.eigh(0.5 * (white + white.T))
-    stretched = root @ axes * np.sqrt(np.maximum(values, 1.0))
-    return np.asarray(stretched @ stretched.T, dtype=np.float64)
 
 
 def _noise(e: FloatArray) -> float:

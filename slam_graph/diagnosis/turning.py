@@ -9,6 +9,7 @@ handedness follows from a singular value decomposition, for every time offset of
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -80,20 +81,20 @@ def coarse_turning(
     grid = offset_s + _OFFSET_STEP_S * np.arange(-steps, steps + 1)
     # at equal misfit the offset nearest to the calibrated one
     order = np.argsort(np.abs(grid - offset_s), kind="stable")
-    moved = [_gyroscope_turns(seen, gyroscopes, offset) for offset in grid[order]]
-    fits = [_best(camera, body, seconds, None) for body in moved]
-    best = int(np.argmin([min(fit[2] for fit in pair) for pair in fits]))
-    proper, mirrored = fits[best]
-    fit, other = (proper, mirrored) if proper[2] <= mirrored[2] else (mirrored, proper)
-    calibrated = min(_best(camera, body, seconds, body_R_camera)[0][2] for body in moved)
+    moved = np.array([_gyroscope_turns(seen, gyroscopes, offset) for offset in grid[order]])
+    handed = [_fits(camera, moved, seconds, _best_turns(sign)) for sign in (1.0, -1.0)]
+    misfits = np.array([fits.misfits for fits in handed])
+    best = int(np.argmin(misfits.min(axis=0)))
+    fits = handed[int(np.argmin(misfits[:, best]))]
+    calibrated = _fits(camera, moved, seconds, lambda _: body_R_camera)
     return Turning(
-        fit[1],
-        fit[0],
+        float(fits.factors[best]),
+        fits.Q[best],
         float(grid[order][best]),
-        fit[3],
-        fit[2],
-        other[2],
-        calibrated,
+        fits.biases[best],
+        float(misfits[:, best].min()),
+        float(misfits[:, best].max()),
+        float(calibrated.misfits.min()),
         size,
         axes,
     )
@@ -116,35 +117,49 @@ def _gyroscope_turns(
     return turns
 
 
-_Fit = tuple[FloatArray, float, float, FloatArray]
-"""Q (3, 3), factor, misfit and bias (3,)."""
+@dataclass(frozen=True, slots=True, eq=False)
+class _Fits:
+    """The best fits of G time offsets: Q (G, 3, 3), or one for all, the others (G,) and (G, 3)."""
+
+    Q: FloatArray
+    factors: FloatArray
+    misfits: FloatArray
+    biases: FloatArray
 
 
-def _best(
-    camera: FloatArray, body: FloatArray, seconds: FloatArray, Q: FloatArray | None
-) -> list[_Fit]:
-    """The best proper and improper fit; of a given Q the only one."""
-    fits = []
-    for handed in (1.0, -1.0) if Q is None else (1.0,):
-        weights = np.ones(len(camera))
-        turn, factor, bias = np.eye(3), 1.0, np.zeros(3)
-        misfit = np.inf
-        for _ in range(_REWEIGHTINGS):
-            total = np.sum(weights * seconds**2)
-            mean = [(weights * seconds) @ vectors / total for vectors in (camera, body)]
-            one, two = camera - np.outer(seconds, mean[0]), body - np.outer(seconds, mean[1])
-            if Q is None:
-                U, _, Vt = np.linalg.svd((two * weights[:, None]).T @ one)
-                turn = (U * (1.0, 1.0, handed * np.linalg.det(U @ Vt))) @ Vt
-            else:
-                turn = Q
-            along = np.sum(weights[:, None] * two * (one @ turn.T))
-            factor = max(float(along / max(np.sum(weights[:, None] * one**2), 1e-12)), 0.0)
-            rest = np.linalg.norm(two - factor * one @ turn.T, axis=1)
-            scale = max(float(np.median(rest)), 1e-9)
-            weights = 1.0 / (1.0 + (rest / (1.5 * scale)) ** 2)
-            bias = mean[1] - factor * turn @ mean[0]
-            size = float(np.quantile(np.linalg.norm(two, axis=1), _MOST))
-            misfit = float(np.quantile(rest, _MOST)) / max(size, 1e-9)
-        fits.append((turn, factor, misfit, bias))
-    return fits
+_Turns = Callable[[FloatArray], FloatArray]
+"""Rotations (G, 3, 3), or one for all, from the moments (G, 3, 3) of body and camera."""
+
+
+def _best_turns(handed: float) -> _Turns:
+    """The orthogonal matrices with a determinant of 1 or -1 that fit best (Kabsch 1976)."""
+
+    def turns(moments: FloatArray) -> FloatArray:
+        U, _, Vt = np.linalg.svd(moments)
+        U[:, :, 2] *= handed * np.linalg.det(U @ Vt)[:, None]
+        return np.asarray(U @ Vt)
+
+    return turns
+
+
+def _fits(camera: FloatArray, moved: FloatArray, seconds: FloatArray, turns: _Turns) -> _Fits:
+    """The fits of camera turns (K, 3) with those of the gyroscope (G, K, 3) at G time offsets."""
+    weights = np.ones(moved.shape[:2])
+    for _ in range(_REWEIGHTINGS):
+        share = weights * seconds / (weights @ seconds**2)[:, None]
+        mean = share @ camera, (share[:, None] @ moved)[:, 0]
+        one, two = (
+            v - seconds[:, None] * m[:, None] for v, m in zip((camera, moved), mean, strict=True)
+        )
+        Q = turns((two * weights[..., None]).swapaxes(1, 2) @ one)
+        turned = one @ Q.swapaxes(-1, -2)
+        along, square = (np.sum(v * w, axis=2) for v, w in ((two, turned), (one, one)))
+        along, square = (np.sum(weights * part, axis=1) for part in (along, square))
+        factors = np.maximum(along / np.maximum(square, 1e-12), 0.0)
+        rest = np.linalg.norm(two - factors[:, None, None] * turned, axis=2)
+        scale = np.maximum(np.median(rest, axis=1), 1e-9)
+        weights = 1.0 / (1.0 + (rest / (1.5 * scale[:, None])) ** 2)
+    sizes = np.quantile(np.linalg.norm(two, axis=2), _MOST, axis=1)
+    misfits = np.quantile(rest, _MOST, axis=1) / np.maximum(sizes, 1e-9)
+    biases = mean[1] - factors[:, None] * (Q @ mean[0][..., None])[..., 0]
+    return _Fits(Q, factors, misfits, biases)
