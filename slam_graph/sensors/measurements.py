@@ -282,14 +282,16 @@ class FeatureFrame:
         """
         missing = (FeatureObservations.empty(),) * (cameras - len(self.cameras))
         seen = self.cameras + missing
-        if all(math.isfinite(c.pixels.sum() + c.normalized.sum()) for c in seen):
+        with np.errstate(invalid="ignore"):  # ∞ - ∞
+            finite = all(math.isfinite(c.pixels.sum() + c.normalized.sum()) for c in seen)
+        if finite:
             return (FeatureFrame(self.stamp_ns, seen) if missing else self), 0
         good = [np.all(np.isfinite(np.hstack([c.pixels, c.normalized])), axis=1) for c in seen]
         bad = sum(int(np.sum(~rows)) for rows in good)
         if not bad:
             return (FeatureFrame(self.stamp_ns, seen) if missing else self), 0
-        finite = (c.select(rows) for c, rows in zip(seen, good, strict=True))
-        return FeatureFrame(self.stamp_ns, tuple(finite)), bad
+        usable = (c.select(rows) for c, rows in zip(seen, good, strict=True))
+        return FeatureFrame(self.stamp_ns, tuple(usable)), bad
 
     def without(self, ids: IntArray) -> FeatureFrame:
         """The frame without these features."""
