@@ -115,9 +115,7 @@ def smallest_eigenvalues(image: _Image) -> _Scores:
     for v in range(height):
         above, below = image[_reflected(v - 1, height)], image[_reflected(v + 1, height)]
         _gradients(above, image[v], below, smooth, rising, dx[v], dy[v])
-    xx, xy, yy = np.empty(width, np.int32), np.empty(width, np.int32), np.empty(width, np.int32)
-    for u in range(width):
-        xx[u] = xy[u] = yy[u] = 0
+    xx, xy, yy = np.zeros(width, np.int32), np.zeros(width, np.int32), np.zeros(width, np.int32)
     sum_xx, sum_xy = np.empty(width, np.int32), np.empty(width, np.int32)
     sum_yy, padded = np.empty(width, np.int32), np.empty(width + 2 * _RADIUS, np.int32)
     unit = 1.0 / (_LARGEST * WINDOW_PX)

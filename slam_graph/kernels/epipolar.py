@@ -68,10 +68,8 @@ def constraint_moments(m_a: FloatArray, m_b: FloatArray) -> FloatArray:
         m_a: (N, 2) normalised points of one image.
         m_b: (N, 2) the same points in the other one.
     """
-    moments, row = np.empty((9, 9)), np.empty(9)
-    for i in range(9):
-        for j in range(9):
-            moments[i, j] = 0.0
+    moments = np.zeros((9, 9))
+    row = np.empty(9)
     for n in range(len(m_a)):
         x, y, u, v = m_a[n, 0], m_a[n, 1], m_b[n, 0], m_b[n, 1]
         row[0], row[1], row[2] = u * x, u * y, u

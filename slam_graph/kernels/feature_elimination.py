@@ -17,7 +17,7 @@ __all__ = ["eliminate_features", "eliminate_features_numpy"]
 @compiled()
 def _inverse_root(V: FloatArray, inverse: FloatArray) -> None:
     """L⁻¹ of V = L Lᵀ, both (3, 3)."""
-    L = np.empty((3, 3))
+    L = np.zeros((3, 3))
     for a in range(3):
         for b in range(a + 1):
             rest = V[a, b]
@@ -83,9 +83,7 @@ def eliminate_features(
         _inverse_root(V, inverse)
         for v in range(first, stop):
             pose = 6 * frame[v]
-            for k in range(3):
-                for a in range(6):
-                    W[k, a] = 0.0
+            W[:] = 0.0
             for n in range(views[v], views[v + 1]):
                 for i in range(2):
                     for a in range(6):

@@ -69,7 +69,7 @@ def fill_templates(
     Returns:
         (N,) whether a patch has contrast; of others nothing is filled.
     """
-    textured = np.empty(len(pixels), np.bool_)
+    textured = np.zeros(len(pixels), np.bool_)
     grey, J = np.empty((_PX + 2, _PX + 2)), np.empty(6)
     H, means, correlations = np.empty((6, 6)), np.empty(6), np.empty(6)
     for i in range(len(pixels)):
@@ -91,14 +91,10 @@ def fill_templates(
             for column in range(1, _PX + 1):
                 squares += (grey[row, column] - mean) ** 2
         deviation = math.sqrt(squares / _COUNT)
-        textured[i] = False
         if deviation < _LEAST_DEVIATION:
             continue
         textured[i] = True
-        for m in range(6):
-            means[m] = correlations[m] = 0.0
-            for j in range(6):
-                H[m, j] = 0.0
+        H[:], means[:], correlations[:] = 0.0, 0.0, 0.0
         for row in range(_PX):
             down = (row - _HALF) / _HALF
             for column in range(_PX):

@@ -78,10 +78,7 @@ def claim(
         if alone:
             chosen[found] = n
             found += 1
-    taken = np.empty((found, 2), np.float32)
-    for k in range(found):
-        taken[k, 0], taken[k, 1] = pixels[chosen[k], 0], pixels[chosen[k], 1]
-    clear_disks(free, taken, half_widths)
+    clear_disks(free, pixels[chosen[:found]], half_widths)
     return chosen[:found]
 
 
@@ -105,9 +102,8 @@ def claim_numpy(
 def apart(pixels: _Pixels, distance_px: float) -> BoolArray:
     """Which points (N, 2) are not within a distance of an earlier one, (N,)."""
     limit = np.float32(distance_px * distance_px)
-    alone = np.empty(len(pixels), np.bool_)
+    alone = np.ones(len(pixels), np.bool_)
     for n in range(len(pixels)):
-        alone[n] = True
         for k in range(n):
             du, dv = pixels[n, 0] - pixels[k, 0], pixels[n, 1] - pixels[k, 1]
             alone[n] &= du * du + dv * dv >= limit

@@ -90,11 +90,8 @@ def motion_steps(
     H, h = np.empty((_SIZE, _SIZE + 1 + velocities)), np.empty(_ENTRIES)
     sums, pulls = np.empty((2, _ENTRIES, _ENTRIES)), np.empty((2, _ENTRIES))
     for j in range(len(x)):
-        for i in range(2):
-            for a in range(_ENTRIES):
-                pulls[i, a] = 0.0
-                for b in range(_ENTRIES):
-                    sums[i, a, b] = 0.0
+        sums[:] = 0.0
+        pulls[:] = 0.0
         squares[j] = 0.0
         for n in range(starts[j], starts[j + 1]):
             for i in range(2):
@@ -111,9 +108,8 @@ def motion_steps(
                     pulls[i, a] += h[a] * r
                     for b in range(a + 1):
                         sums[i, a, b] += h[a] * h[b]
+        H[:] = 0.0
         for a in range(_SIZE):
-            for b in range(H.shape[1]):
-                H[a, b] = 0.0
             H[a, a] = information[a]
             H[a, _SIZE] = information[a] * (before[j, a] - x[j, a])
         for i in range(2):

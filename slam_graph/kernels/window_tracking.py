@@ -365,9 +365,8 @@ def track_windows(
         found: (N,) whether they were tracked, forward and backward.
         error_px: (N,) forward-backward error; infinite where a point was not found.
     """
-    n = len(points)
+    n, scale = len(points), np.float32(1.0) / np.float32(1 << levels)
     moved, found = np.empty((n, 2), np.float32), np.empty(n, np.bool_)
-    scale = np.float32(1.0) / np.float32(1 << levels)
     for i in range(n):
         moved[i, 0], moved[i, 1] = start[i, 0] * scale, start[i, 1] * scale
         found[i] = True
@@ -377,23 +376,20 @@ def track_windows(
         for i in range(n if level > 0 else 0):
             moved[i, 0], moved[i, 1] = np.float32(2.0) * moved[i, 0], np.float32(2.0) * moved[i, 1]
     height, width = target.shape
-    rows = np.empty(n, np.int64)
-    count = 0
+    rows, error_px, count = np.empty(n, np.int64), np.empty(n, np.float32), 0
     for i in range(n):
         u, v = moved[i, 0], moved[i, 1]
         found[i] &= u >= border_px and u <= width - 1 - border_px
         found[i] &= v >= border_px and v <= height - 1 - border_px
-        rows[count] = i
+        rows[count], error_px[i] = i, np.inf
         count += found[i]
     ends, back = np.empty((count, 2), np.float32), np.empty((count, 2), np.float32)
-    returned, error_px = np.empty(count, np.bool_), np.empty(n, np.float32)
-    for i in range(n):
-        error_px[i] = np.inf
+    returned = np.empty(count, np.bool_)
     for k in range(count):
         i, returned[k] = rows[k], True
         ends[k, 0], ends[k, 1] = moved[i, 0], moved[i, 1]
         back[k, 0], back[k, 1] = points[i, 0], points[i, 1]
-    level = np.int64(0)  # not as a literal, for which all would be compiled once more
+    # The level is 0 by now; for a literal 0 all would be compiled once more
     _track_level(target, source, ends, back, returned, level, iterations, step_px, least_eigenvalue)
     for k in range(count):
         i = rows[k]
