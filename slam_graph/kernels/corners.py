@@ -79,10 +79,15 @@ def strongest_maxima(
         (N, 3) column, row and score, the best first.
     """
     height, width = scores.shape
-    highest, is_maximum = np.zeros(width, np.float32), np.zeros(width, np.uint8)
+    highest, is_maximum = np.empty(width, np.float32), np.empty(width, np.uint8)
+    for u in range(width):
+        highest[u] = 0.0
     for v in range(height):
         _raise_to(highest, scores[v], allowed[v])
-    limit = np.float32(float(highest.max()) * share)
+    largest = np.float32(0.0)
+    for u in range(width):
+        largest = highest[u] if highest[u] > largest else largest
+    limit = np.float32(float(largest) * share)
     found = np.empty((height * width, 3), np.float32)
     n = 0
     for v in range(1, height - 1):

@@ -31,7 +31,7 @@ _REGULARISATION = 1e-15
 @compiled()
 def _orthonormalize(Q: FloatArray, m: int, R: FloatArray) -> None:
     """Make the columns of (m, 3) rows orthonormal; R (3, 3) is what they were multiplied with."""
-    L, before = np.zeros((3, 3)), np.empty((3, 3))
+    L, before = np.empty((3, 3)), np.empty((3, 3))
     for a in range(3):
         for b in range(3):
             R[a, b] = 1.0 if a == b else 0.0
@@ -46,13 +46,14 @@ def _orthonormalize(Q: FloatArray, m: int, R: FloatArray) -> None:
             s21 += z * y
             s22 += z * z
         added = _REGULARISATION * (s00 + s11 + s22)
-        L[0, 0] = math.sqrt(s00 + added)
-        L[1, 0], L[2, 0] = s10 / L[0, 0], s20 / L[0, 0]
-        L[1, 1] = math.sqrt(s11 + added - L[1, 0] * L[1, 0])
-        L[2, 1] = (s21 - L[2, 0] * L[1, 0]) / L[1, 1]
-        L[2, 2] = math.sqrt(s22 + added - L[2, 0] * L[2, 0] - L[2, 1] * L[2, 1])
-        i0, i1, i2 = 1.0 / L[0, 0], 1.0 / L[1, 1], 1.0 / L[2, 2]
-        l10, l20, l21 = L[1, 0], L[2, 0], L[2, 1]
+        l00 = math.sqrt(s00 + added)
+        l10, l20 = s10 / l00, s20 / l00
+        l11 = math.sqrt(s11 + added - l10 * l10)
+        l21 = (s21 - l20 * l10) / l11
+        l22 = math.sqrt(s22 + added - l20 * l20 - l21 * l21)
+        L[0, 0], L[1, 0], L[1, 1] = l00, l10, l11
+        L[2, 0], L[2, 1], L[2, 2] = l20, l21, l22
+        i0, i1, i2 = 1.0 / l00, 1.0 / l11, 1.0 / l22
         for i in range(m):
             x = Q[i, 0] * i0
             y = (Q[i, 1] - l10 * x) * i1
@@ -237,7 +238,7 @@ def block_sums(
     for j in range(len(starts) - 1):
         longest = max(longest, starts[j + 1] - starts[j])
     Q, R, e = np.empty((2 * longest, 3)), np.empty((3, 3)), np.empty(2 * longest)
-    along, gram, means = np.empty(3), np.empty((3, 3)), np.zeros((longest // block + 1, 2, 4))
+    along, gram, means = np.empty(3), np.empty((3, 3)), np.empty((longest // block + 1, 2, 4))
     member, later = np.empty(longest, np.int64), np.empty(longest // block + 1)
     behind = np.empty((2, 3))
     for j in range(len(starts) - 1):

@@ -15,25 +15,32 @@ __all__ = ["triangularize_features", "triangularize_features_numpy"]
 
 
 @compiled()
-def _reflect(A: FloatArray, B: FloatArray, column: int, rows: int) -> None:
-    """The reflection that zeroes a column of A (m, 3) below the diagonal; the same of B (m, n)."""
+def _reflect(A: FloatArray, B: FloatArray, column: int, v: FloatArray, product: FloatArray) -> None:
+    """The reflection that zeroes a column of A (m, 3) below the diagonal; the same of B (m, n).
+
+    There is room for m and for max(3, n) numbers in `v` and `product`.
+    """
+    rows = len(A)
     squares = 0.0
     for i in range(column, rows):
         squares += A[i, column] * A[i, column]
     if squares == 0.0:
         return
-    v = A[column:, column].copy()
+    count = rows - column
+    for i in range(count):
+        v[i] = A[column + i, column]
     v[0] += math.copysign(math.sqrt(squares), v[0])
     scale = 0.0
-    for i in range(len(v)):
+    for i in range(count):
         scale += v[i] * v[i]
     for M in (A, B):
-        product = np.zeros(M.shape[1])
-        for i in range(len(v)):
+        for k in range(M.shape[1]):
+            product[k] = 0.0
+        for i in range(count):
             if v[i] != 0.0:
                 for k in range(M.shape[1]):
                     product[k] += v[i] * M[column + i, k]
-        for i in range(len(v)):
+        for i in range(count):
             if v[i] != 0.0:
                 factor = 2.0 / scale * v[i]
                 for k in range(M.shape[1]):
@@ -48,10 +55,10 @@ def triangularize_features(A: FloatArray, B: FloatArray) -> None:
         A: (J, m, 3) coefficients of the positions; R in the first three rows afterwards.
         B: (J, m, n) all others of the same rows.
     """
-    features, rows, _ = A.shape
-    for j in range(features):
+    v, product = np.empty(A.shape[1]), np.empty(max(3, B.shape[2]))
+    for j in range(len(A)):
         for column in range(3):
-            _reflect(A[j], B[j], column, rows)
+            _reflect(A[j], B[j], column, v, product)
 
 
 def triangularize_features_numpy(A: FloatArray, B: FloatArray) -> None:

@@ -117,7 +117,8 @@ def _step(system: FloatArray, sums: _Sums, products: FloatArray, step: FloatArra
         The correlation; -1 where the window has no contrast.
     """
     totals, squares, by_template, along_x, along_y, row_x, row_y = sums
-    products[:] = 0.0
+    for m in range(6):
+        products[m] = 0.0
     total = square = template_sum = 0.0
     for k in range(PATCH_PX):
         across = (k - _HALF) / _HALF
@@ -184,21 +185,23 @@ def align_patches(
             the first window reaches out of the image.
     """
     height, width = image.shape
-    found, correlations = np.zeros(len(points), np.bool_), np.zeros(len(points))
+    found, correlations = np.empty(len(points), np.bool_), np.empty(len(points))
     # one by one, so that the compiler sees that none overlaps another
-    u, v = np.zeros(ROW_PX, np.int32), np.zeros(ROW_PX, np.int32)
-    g00, g01 = np.zeros(ROW_PX, np.int32), np.zeros(ROW_PX, np.int32)
-    g10, g11 = np.zeros(ROW_PX, np.int32), np.zeros(ROW_PX, np.int32)
-    grey, right, below = np.zeros(ROW_PX), np.zeros(ROW_PX), np.zeros(ROW_PX)
-    s0, s1, s2, s3 = np.zeros(ROW_PX), np.zeros(ROW_PX), np.zeros(ROW_PX), np.zeros(ROW_PX)
-    s4, s5, s6 = np.zeros(ROW_PX), np.zeros(ROW_PX), np.zeros(ROW_PX)
+    u, v = np.empty(ROW_PX, np.int32), np.empty(ROW_PX, np.int32)
+    g00, g01 = np.empty(ROW_PX, np.int32), np.empty(ROW_PX, np.int32)
+    g10, g11 = np.empty(ROW_PX, np.int32), np.empty(ROW_PX, np.int32)
+    for k in range(ROW_PX):  # the last one of a row is not filled
+        g00[k] = g01[k] = g10[k] = g11[k] = 0
+    grey, right, below = np.empty(ROW_PX), np.empty(ROW_PX), np.empty(ROW_PX)
+    s0, s1, s2, s3 = np.empty(ROW_PX), np.empty(ROW_PX), np.empty(ROW_PX), np.empty(ROW_PX)
+    s4, s5, s6 = np.empty(ROW_PX), np.empty(ROW_PX), np.empty(ROW_PX)
     cells, values = (u, v, g00, g01, g10, g11), (grey, right, below)
     sums = s0, s1, s2, s3, s4, s5, s6
     products, step = np.empty(6), np.empty(6)
     for i in range(len(points)):
         n, x, y = rows[i], points[i, 0], points[i, 1]
         a, b, c, d = warps[n, 0, 0], warps[n, 0, 1], warps[n, 1, 0], warps[n, 1, 1]
-        inside = True
+        found[i], correlations[i], inside = False, 0.0, True
         for _ in range(iterations):
             reach_x, reach_y = _HALF * (abs(a) + abs(b)), _HALF * (abs(c) + abs(d))
             inside = x >= reach_x and y >= reach_y

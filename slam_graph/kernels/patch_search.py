@@ -80,7 +80,7 @@ def most_similar(
         (N,) their indices.
     """
     height, width = other.shape
-    best = np.zeros(len(points), np.int64)
+    best = np.empty(len(points), np.int64)
     pixels = (2 * radius + 1) ** 2
     patch, candidate = np.empty(pixels, np.int16), np.empty(pixels, np.int16)
     for n in range(len(points)):
@@ -92,7 +92,7 @@ def most_similar(
             r = np.int64(patch[k])
             sum_r += r
             sum_rr += r * r
-        scores[n], score = -1.0, -1.0
+        scores[n], best[n], score = -1.0, 0, -1.0
         last_a, last_b = -1, -1
         for c in range(candidates.shape[1]):
             x, y = candidates[n, c]

@@ -30,14 +30,15 @@ _CONVERGED = 1e-7
 @compiled()
 def _solve(A: FloatArray, b: FloatArray, x: FloatArray) -> None:
     """The solution x (3,) of A x = b for a positive definite A (3, 3), by LDLᵀ."""
-    l10, l20 = A[1, 0] / A[0, 0], A[2, 0] / A[0, 0]
-    d1 = A[1, 1] - l10 * A[1, 0]
-    l21 = (A[2, 1] - l20 * A[1, 0]) / d1
-    d2 = A[2, 2] - l20 * A[2, 0] - l21 * l21 * d1
-    y1 = b[1] - l10 * b[0]
-    x[2] = (b[2] - l20 * b[0] - l21 * y1) / d2
-    x[1] = y1 / d1 - l21 * x[2]
-    x[0] = b[0] / A[0, 0] - l10 * x[1] - l20 * x[2]
+    d0, a10, a20, b0 = A[0, 0], A[1, 0], A[2, 0], b[0]
+    l10, l20 = a10 / d0, a20 / d0
+    d1 = A[1, 1] - l10 * a10
+    l21 = (A[2, 1] - l20 * a10) / d1
+    d2 = A[2, 2] - l20 * a20 - l21 * l21 * d1
+    y1 = b[1] - l10 * b0
+    x2 = (b[2] - l20 * b0 - l21 * y1) / d2
+    x1 = y1 / d1 - l21 * x2
+    x[0], x[1], x[2] = b0 / d0 - l10 * x1 - l20 * x2, x1, x2
 
 
 @compiled()
@@ -45,9 +46,11 @@ def _nearest_to_rays(
     R: FloatArray, p: FloatArray, normalized: FloatArray, first: int, last: int, point: FloatArray
 ) -> None:
     """The point (3,) with the least sum of squared distances to the rays of one feature."""
-    lhs, rhs, b, offset = np.zeros((3, 3)), np.zeros(3), np.empty(3), np.empty(3)
+    lhs, rhs, b, offset = np.empty((3, 3)), np.empty(3), np.empty(3), np.empty(3)
     for i in range(3):
-        lhs[i, i] = _REGULARISATION
+        rhs[i] = 0.0
+        for k in range(3):
+            lhs[i, k] = _REGULARISATION if i == k else 0.0
     for n in range(first, last):
         u, v = normalized[n, 0], normalized[n, 1]
         length = math.sqrt(u * u + v * v + 1.0)
@@ -79,22 +82,27 @@ def _normal_equations(
     """Squared error, JᵀJ (3, 3) and Jᵀr (3,) of one feature at x (3,)."""
     l00 = l10 = l11 = l20 = l21 = l22 = 0.0
     b0 = b1 = b2 = error = 0.0
+    x0, x1, x2 = x[0], x[1], x[2]
     for n in range(first, last):
-        A, d = R[n], t[n]
-        z = A[2, 0] * x[0] + A[2, 1] * x[1] + A[2, 2] + x[2] * d[2]
+        a00, a01 = R[n, 0, 0], R[n, 0, 1]
+        a10, a11 = R[n, 1, 0], R[n, 1, 1]
+        a20, a21 = R[n, 2, 0], R[n, 2, 1]
+        d0, d1, d2 = t[n, 0], t[n, 1], t[n, 2]
+        z = a20 * x0 + a21 * x1 + R[n, 2, 2] + x2 * d2
         inverse = 1.0 / max(z, _NEAREST)
-        u = (A[0, 0] * x[0] + A[0, 1] * x[1] + A[0, 2] + x[2] * d[0]) * inverse
-        v = (A[1, 0] * x[0] + A[1, 1] * x[1] + A[1, 2] + x[2] * d[1]) * inverse
+        u = (a00 * x0 + a01 * x1 + R[n, 0, 2] + x2 * d0) * inverse
+        v = (a10 * x0 + a11 * x1 + R[n, 1, 2] + x2 * d1) * inverse
         r, s = normalized[n, 0] - u, normalized[n, 1] - v
-        u0, v0 = (A[0, 0] - u * A[2, 0]) * inverse, (A[1, 0] - v * A[2, 0]) * inverse
-        u1, v1 = (A[0, 1] - u * A[2, 1]) * inverse, (A[1, 1] - v * A[2, 1]) * inverse
-        u2, v2 = (d[0] - u * d[2]) * inverse, (d[1] - v * d[2]) * inverse
+        u0, v0 = (a00 - u * a20) * inverse, (a10 - v * a20) * inverse
+        u1, v1 = (a01 - u * a21) * inverse, (a11 - v * a21) * inverse
+        u2, v2 = (d0 - u * d2) * inverse, (d1 - v * d2) * inverse
         if len(weights):
-            w = weights[n]
-            r, s = w[0, 0] * r + w[0, 1] * s, w[1, 0] * r + w[1, 1] * s
-            u0, v0 = w[0, 0] * u0 + w[0, 1] * v0, w[1, 0] * u0 + w[1, 1] * v0
-            u1, v1 = w[0, 0] * u1 + w[0, 1] * v1, w[1, 0] * u1 + w[1, 1] * v1
-            u2, v2 = w[0, 0] * u2 + w[0, 1] * v2, w[1, 0] * u2 + w[1, 1] * v2
+            a, b = weights[n, 0, 0], weights[n, 0, 1]
+            c, d = weights[n, 1, 0], weights[n, 1, 1]
+            r, s = a * r + b * s, c * r + d * s
+            u0, v0 = a * u0 + b * v0, c * u0 + d * v0
+            u1, v1 = a * u1 + b * v1, c * u1 + d * v1
+            u2, v2 = a * u2 + b * v2, c * u2 + d * v2
         error += r * r + s * s
         b0 += u0 * r + v0 * s
         b1 += u1 * r + v1 * s
@@ -144,11 +152,12 @@ def _refine(
     """Move x (J, 3) by damped steps; JᵀJ (J, 3, 3) there is filled."""
     count = len(x)
     rhs, error = np.empty((count, 3)), np.empty(count)
-    damping = np.full(count, 1e-3)
+    damping = np.empty(count)
     damped, step, trial = np.empty((3, 3)), np.empty(3), np.empty(3)
     trial_lhs, trial_rhs = np.empty((3, 3)), np.empty(3)
     for j in range(count):
         first, last = starts[j], starts[j + 1]
+        damping[j] = 1e-3
         error[j] = _normal_equations(R, t, normalized, weights, first, last, x[j], lhs[j], rhs[j])
     for _ in range(STEPS):
         converged = True
@@ -208,34 +217,37 @@ def triangulate_rays(
         parallax: (J,), filled: largest angle in rad between the first ray and any other, from the
             point to the cameras.
     """
-    R, t = np.empty_like(world_R_camera), np.empty_like(world_p_camera)
+    N = len(normalized)
+    R, t = np.empty((N, 3, 3)), np.empty((N, 3))
     x, lhs = np.empty((len(points), 3)), np.empty((len(points), 3, 3))
     for j in range(len(points)):
         home = starts[j]
         for n in range(home, starts[j + 1]):
             for i in range(3):
-                t[n, i] = 0.0
+                moved = 0.0
                 for k in range(3):
                     away = world_p_camera[home, k] - world_p_camera[n, k]
-                    t[n, i] += world_R_camera[n, k, i] * away
-                    R[n, i, k] = 0.0
+                    moved += world_R_camera[n, k, i] * away
+                    turned = 0.0
                     for m in range(3):
-                        R[n, i, k] += world_R_camera[n, m, i] * world_R_camera[home, m, k]
+                        turned += world_R_camera[n, m, i] * world_R_camera[home, m, k]
+                    R[n, i, k] = turned
+                t[n, i] = moved
         _nearest_to_rays(world_R_camera, world_p_camera, normalized, home, starts[j + 1], points[j])
         _start(world_R_camera[home], world_p_camera[home], normalized[home], points[j], x[j])
     _refine(R, t, normalized, weights, starts, x, lhs)
-    known, unit, toward = np.empty(3), np.zeros(3), np.empty((2, 3))
-    unit[2] = 1.0
+    known, unit, toward = np.empty(3), np.empty(3), np.empty((2, 3))
+    unit[0], unit[1], unit[2] = 0.0, 0.0, 1.0
     for j in range(len(points)):
         home = starts[j]
+        x0, x1, x2 = x[j, 0], x[j, 1], x[j, 2]
         for i in range(3):
-            A = world_R_camera[home, i]
-            points[j, i] = (
-                world_p_camera[home, i] + (A[0] * x[j, 0] + A[1] * x[j, 1] + A[2]) / x[j, 2]
-            )
+            along = world_R_camera[home, i, 0] * x0 + world_R_camera[home, i, 1] * x1
+            along += world_R_camera[home, i, 2]
+            points[j, i] = world_p_camera[home, i] + along / x2
             lhs[j, i, i] += _REGULARISATION
         _solve(lhs[j], unit, known)
-        depth_error[j] = math.sqrt(known[2]) / x[j, 2]
+        depth_error[j] = math.sqrt(known[2]) / x2
         smallest = 1.0
         for n in range(home, starts[j + 1]):
             row = 0 if n == home else 1

@@ -258,15 +258,15 @@ def _track_level(
     grey, moved = np.zeros(_LENGTH, np.int16), np.zeros(_LENGTH, np.int16)
     gx, gy = np.zeros(_LENGTH, np.int16), np.zeros(_LENGTH, np.int16)
     used = np.zeros(_LENGTH, np.int16)
-    for row in range(WINDOW_PX):
-        used[row * _STRIDE : row * _STRIDE + WINDOW_PX] = -1  # all bits
+    for k in range(WINDOW_PX * _STRIDE):
+        used[k] = -1 if k % _STRIDE < WINDOW_PX else 0  # all bits
     for i in range(len(points)):
         x, y = points[i, 0] * scale - half, points[i, 1] * scale - half
         u, v, weights = _cell(x, y)
         if _outside(u, v, source):
             good[i] &= level > 0
             continue
-        _copy(source, u - 1, v - 1, _STRIDE, pixels)
+        _copy(source, u - 1, v - 1, WINDOW_PX + 3, pixels)
         _blend_in_halves(pixels, weights, dx, dy)
         _middle(dx, dy, grey)
         if u < 0 or v < 0 or u + WINDOW_PX >= source.shape[1] or v + WINDOW_PX >= source.shape[0]:
@@ -365,32 +365,32 @@ def track_windows(
         found: (N,) whether they were tracked, forward and backward.
         error_px: (N,) forward-backward error; infinite where a point was not found.
     """
-    n = len(points)
-    moved, found = np.empty((n, 2), np.float32), np.ones(n, np.bool_)
-    scale = np.float32(1.0) / np.float32(1 << levels)
+    n, scale = len(points), np.float32(1.0) / np.float32(1 << levels)
+    moved, found = np.empty((n, 2), np.float32), np.empty(n, np.bool_)
     for i in range(n):
         moved[i, 0], moved[i, 1] = start[i, 0] * scale, start[i, 1] * scale
+        found[i] = True
     for level in range(levels, -1, -1):
         one, other = _level(source, source_halvings, level), _level(target, target_halvings, level)
         _track_level(one, other, points, moved, found, level, iterations, step_px, least_eigenvalue)
         for i in range(n if level > 0 else 0):
             moved[i, 0], moved[i, 1] = np.float32(2.0) * moved[i, 0], np.float32(2.0) * moved[i, 1]
     height, width = target.shape
-    rows = np.empty(n, np.int64)
-    count = 0
+    rows, error_px, count = np.empty(n, np.int64), np.empty(n, np.float32), 0
     for i in range(n):
         u, v = moved[i, 0], moved[i, 1]
         found[i] &= u >= border_px and u <= width - 1 - border_px
         found[i] &= v >= border_px and v <= height - 1 - border_px
-        rows[count] = i
+        rows[count], error_px[i] = i, np.inf
         count += found[i]
     ends, back = np.empty((count, 2), np.float32), np.empty((count, 2), np.float32)
-    returned, error_px = np.ones(count, np.bool_), np.full(n, np.inf, np.float32)
+    returned = np.empty(count, np.bool_)
     for k in range(count):
-        i = rows[k]
+        i, returned[k] = rows[k], True
         ends[k, 0], ends[k, 1] = moved[i, 0], moved[i, 1]
         back[k, 0], back[k, 1] = points[i, 0], points[i, 1]
-    _track_level(target, source, ends, back, returned, 0, iterations, step_px, least_eigenvalue)
+    # The level is 0 by now; for a literal 0 all would be compiled once more
+    _track_level(target, source, ends, back, returned, level, iterations, step_px, least_eigenvalue)
     for k in range(count):
         i = rows[k]
         found[i] = returned[k]
