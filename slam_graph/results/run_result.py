@@ -21,6 +21,7 @@ from slam_graph.errors import DataError, EstimationError
 from slam_graph.geometry import AlignmentMode, StateHistory, Trajectory
 from slam_graph.results import metrics as tables
 from slam_graph.results import result_files as names
+from slam_graph.results.free_memory import give_back
 from slam_graph.results.localization_result import LocalizationLog
 from slam_graph.results.map_output import PointMap, save_map, write_ply
 from slam_graph.results.object_files import objects_table, save_objects
@@ -363,6 +364,7 @@ class RunResult(RunSummary):
         for stamp_ns, graph in self.graphs.items():
             for name, text in graph.texts().items():
                 files.text(f"graph_{stamp_ns}_{name}", [text])
+        give_back()  # what the run and the files took: matplotlib needs 30 MB
         with files.appearing("trajectory.png") as partial:
             self.plot().write(partial)
         if self.slam_map is not None:  # last: it is the file that a full disk is too small for

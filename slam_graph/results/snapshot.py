@@ -4,13 +4,12 @@
 
 from __future__ import annotations
 
-import ctypes
-import sys
 from dataclasses import replace
 from pathlib import Path
 
 from slam_graph.datasets import kalibr_text
 from slam_graph.results import result_files as names
+from slam_graph.results.free_memory import give_back
 from slam_graph.results.map_output import PointMap, write_ply
 from slam_graph.results.result_files import ResultFolder
 from slam_graph.results.run_input import Ending
@@ -37,7 +36,7 @@ def save_so_far(result: RunResult, folder: Path, wall_s: float) -> None:
         _write(now, ResultFolder(folder))
     finally:
         del now
-        _give_back()
+        give_back()
 
 
 def _write(now: RunResult, files: ResultFolder) -> None:
@@ -53,15 +52,3 @@ def _write(now: RunResult, files: ResultFolder) -> None:
     write_ply(files.path(names.POINTS), now.points)
     files.text(names.TIMING, now.logs.timing.csv_lines())
     files.text(names.FRAMES, now.logs.by_frame.csv_lines(now.keyframes_ns, now.nees_series))
-
-
-def _give_back() -> None:
-    """Give free memory back to the system, where the C library is glibc.
-
-    The arrays that the files are made of take 1.8 kB a state. They are freed at once, but glibc
-    keeps what was freed for what may come, most of it until the run ends.
-    """
-    if sys.platform.startswith("linux"):
-        trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
-        if trim is not None:
-            trim(0)
