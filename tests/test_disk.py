@@ -29,7 +29,7 @@ class Stock:
     """Recordings and results to begin with."""
 
     def __init__(self, folder: Path) -> None:
-        self.kernels = folder / "kernels"
+        self.fonts = folder / "fonts"
         self.images, self.tracks, self.run = folder / "images", folder / "tracks", folder / "runs"
         images = ["--kind", "images", "--duration", "1", "--rate", "4"]
         tracks = ["--duration", "2.5", "--set", "tracks.descriptors=true"]
@@ -54,7 +54,7 @@ class Stock:
     def command(
         self, arguments: list[str], folder: Path, limit: int | None = None
     ) -> subprocess.CompletedProcess[str]:
-        """Run a command; its files may have so many bytes. Kernels are compiled once for all."""
+        """Run a command; its files may have so many bytes. Matplotlib looks for fonts only once."""
 
         def bound() -> None:
             signal.signal(signal.SIGXFSZ, signal.SIG_IGN)  # to write gives an error then
@@ -68,7 +68,7 @@ class Stock:
             text=True,
             timeout=HANG_S,
             preexec_fn=bound,
-            env={**os.environ, "MPLCONFIGDIR": str(folder), "NUMBA_CACHE_DIR": str(self.kernels)},
+            env={**os.environ, "MPLCONFIGDIR": str(self.fonts)},
         )
 
 
