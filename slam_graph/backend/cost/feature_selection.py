@@ -121,7 +121,9 @@ class FeatureSelection:
         tracks, policy = window.tracks, self.policy
         ids, lengths = tracks.lengths()
         removals.add_features(Outcome.DYNAMIC, dynamic)
-        outside = ~is_in(ids, window.state_features) & ~is_in(ids, dynamic)
+        outside = ~is_in(ids, window.state_features)
+        if len(dynamic):
+            outside &= ~is_in(ids, dynamic)
         ids, lengths = ids[outside], lengths[outside]
         live = is_in(ids, tracks.seen)
         lasting = live & (lengths >= policy.frames_before_state) & (room > 0)
