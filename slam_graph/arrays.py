@@ -103,5 +103,6 @@ def skew(v: FloatArray) -> FloatArray:
 
 def median(values: NDArray[Any]) -> FloatArray:
     """The median along the first axis of an array; NumPy's takes many times as long."""
-    ascending, count = np.sort(values, axis=0), len(values)
+    ascending, count = values.copy(), len(values)
+    ascending.sort(axis=0)
     return np.asarray(0.5 * (ascending[(count - 1) // 2] + ascending[count // 2]))

@@ -152,6 +152,7 @@ class RotationProblem:
         rows = self._pixels[..., 1] / camera.camera.height - 0.5
         self._row = np.where(self._there, rows, 0.0)
         self._bearings: dict[float, tuple[FloatArray, FloatArray, BoolArray]] = {}
+        self._motions: dict[float, tuple[FloatArray, FloatArray, FloatArray]] = {}
         self._latest: tuple[Kinematics, _Turned] | None = None
 
     def bearings(self, focal: float) -> tuple[FloatArray, FloatArray, BoolArray]:
@@ -175,6 +176,21 @@ class RotationProblem:
             self._bearings[focal] = rays[0], slopes, known
         return self._bearings[focal]
 
+    def _motion(self, offset_s: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Turns (P, 3, 3) of the body, half of each as a vector (P, 3), and rates (2, P, 3)."""
+        if offset_s not in self._motions:
+            R, rates = np.empty((2, len(self._part), 3, 3)), np.empty((2, len(self._part), 3))
+            for number, gyroscope in enumerate(self._gyroscopes):
+                of = self._part == number
+                for k, t in enumerate(self._t + offset_s):
+                    R[k, of] = gyroscope.orientation(t[of])
+                    rates[k, of] = gyroscope.rate_at(t[of])
+            body = R[0].transpose(0, 2, 1) @ R[1]
+            if len(self._motions) > 4:
+                self._motions.clear()
+            self._motions[offset_s] = body, Rotation.from_matrix(body).as_rotvec() * 0.5, rates
+        return self._motions[offset_s]
+
     def _turned(self, at: Kinematics) -> _Turned:
         """Bearings of both frames, turned into the camera of the first one.
 
@@ -188,17 +204,10 @@ class RotationProblem:
         """`_turned` computed anew."""
         f, slopes, _ = self.bearings(at.focal)
         C, t = at.body_R_camera, self._t + at.offset_s
-        R, rates = np.empty((2, len(self._part), 3, 3)), np.empty((2, len(self._part), 3))
-        for number, gyroscope in enumerate(self._gyroscopes):
-            of = self._part == number
-            for k in range(2):
-                R[k, of] = gyroscope.orientation(t[k, of])
-                rates[k, of] = (gyroscope.rate_at(t[k, of]) - at.bias) / at.scale
+        body, half, rates = self._motion(at.offset_s)
         if at.readout_s != 0.0:
-            seconds = self._row * at.readout_s
+            seconds, rates = self._row * at.readout_s, (rates - at.bias) / at.scale
             f = f + np.cross((rates @ C)[:, :, None, :] * seconds[..., None], f)
-        body = R[0].transpose(0, 2, 1) @ R[1]
-        half = Rotation.from_matrix(body).as_rotvec() * 0.5
         by_bias = (at.bias * (t[1] - t[0])[:, None])[..., None]
         drift = Rotation.from_rotvec(-half).as_matrix() @ by_bias
         body = body @ Rotation.from_rotvec(-drift[..., 0]).as_matrix()
@@ -276,8 +285,7 @@ class RotationProblem:
         columns = [k for k, name in enumerate(WITH_SCALE) if name in free]
         at, noise = start, self.noise_px(start)
         weight = 1.0 / _PRIOR[columns] ** 2
-        information = np.zeros((1, len(columns), len(columns)))
-        scores = np.zeros((1, len(columns)))
+        information, scores = np.zeros((1, len(weight), len(weight))), np.zeros((1, len(weight)))
         for _ in range(_MOST_STEPS):
             information, scores = self._normal_equations(at, noise, columns)
             prior = np.zeros(len(WITH_SCALE))

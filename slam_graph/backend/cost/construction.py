@@ -159,7 +159,7 @@ class CostConstruction:
         in_state = window.state_features[is_in(window.state_features, waiting)]
         cost.landmarks = window.tracks.observations(in_state)
         cost.tracks = self._selection.new_features(
-            window, poses, len(in_state), self._dynamic, removals
+            window, cost.state, poses, len(in_state), self._dynamic, removals
         )
         offered = cost.tracks
         gate, linear = self._apply_gate(window, cost, predicted, removals)
