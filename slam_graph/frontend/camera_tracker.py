@@ -126,7 +126,9 @@ class CameraTracker:
             after = self._recovered(before, after)
         alone = apart(np.ascontiguousarray(after.pixels), _MERGE_DISTANCE_PX)
         self._stats.count(lost_merged=~alone)
-        return self._with_residual_flow(before, after.select(alone))
+        if not alone.all():
+            after = after.select(alone)
+        return self._with_residual_flow(before, after)
 
     def replenish(self, before: Tracks, after: Tracks, next_id: int) -> Tracks:
         """Add new features where an image has few.

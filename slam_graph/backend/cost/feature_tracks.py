@@ -348,10 +348,10 @@ class FeatureTracks:
         if frames is not None:
             wanted &= _is_among(self._frames, frames)
         rows = wanted.nonzero()[0]
-        features, numbers, cameras = self._numbers.take(rows, axis=1)
+        _, numbers, cameras = self._numbers.take(rows, axis=1)
         pixels, normalized = self._places.take(rows, axis=1)
         order, frame = _numbered(numbers)
-        feature = ids.searchsorted(features)
+        feature = ids.searchsorted(self._features).repeat(self._counts).take(rows)
         return Observations(ids, tuple(order.tolist()), feature, frame, cameras, pixels, normalized)
 
 
