@@ -81,9 +81,13 @@ def ascending_union(*parts: IntArray) -> IntArray:
     some = [part for part in parts if len(part)]
     if not some:
         return np.zeros(0, np.int64)
-    values = np.sort(np.concatenate(some) if len(some) > 1 else some[0])
+    if len(some) > 1:
+        values = np.concatenate(some)
+        values.sort()
+    else:
+        values = np.sort(some[0])
     first = np.empty(len(values), np.bool_)
-    first[:1] = True
+    first[0] = True
     np.not_equal(values[1:], values[:-1], out=first[1:])
     return values[first]
 
@@ -99,5 +103,6 @@ def skew(v: FloatArray) -> FloatArray:
 
 def median(values: NDArray[Any]) -> FloatArray:
     """The median along the first axis of an array; NumPy's takes many times as long."""
-    ascending, count = np.sort(values, axis=0), len(values)
+    ascending, count = values.copy(), len(values)
+    ascending.sort(axis=0)
     return np.asarray(0.5 * (ascending[(count - 1) // 2] + ascending[count // 2]))

@@ -60,9 +60,10 @@ def frame_pairs(
     chosen = []
     for number, part in enumerate(parts):
         seen = [f for f in part.frames if f.cameras and len(f.cameras[0]) >= _FEWEST]
+        ids = [set(frame.cameras[0].ids.tolist()) for frame in seen]
         k = 0
         while k < len(seen) - 1:
-            second = _partner(seen, k)
+            second = _partner(seen, ids, k)
             if second > k:
                 chosen.append((number, seen[k], seen[second]))
             k = max(second, k + 1)
@@ -73,13 +74,19 @@ def frame_pairs(
     ]
 
 
-def _partner(frames: list[FeatureFrame], first: int) -> int:
-    """The latest frame that shares enough features with a frame; that frame itself if none."""
+def _partner(frames: list[FeatureFrame], ids: list[set[int]], first: int) -> int:
+    """The latest frame that shares enough features with a frame; that frame itself if none.
+
+    Args:
+        frames: in the order of time.
+        ids: of their features; sets of so few are compared faster than arrays.
+        first: number of the frame.
+    """
     best = first
     for k in range(first + 1, len(frames)):
         if frames[k].stamp_ns - frames[first].stamp_ns > _LONGEST_S * 1e9:
             break
-        common = np.intersect1d(frames[first].cameras[0].ids, frames[k].cameras[0].ids).size
+        common = len(ids[first] & ids[k])
         if common >= _COMMON or (common >= _FEWEST and best == first):
             best = k
     return best

@@ -94,7 +94,7 @@ class CameraTracker:
                     self._lost.turn(turn)
             guess = self._predictor.predict(before, stamp_ns, feedback)
             found = self._associator.follow(before, image, guess)
-            kept = np.flatnonzero(found.good)
+            kept = found.good.nonzero()[0]
             allowed = self._extractor.allows(found.points.take(kept, axis=0))
             kept = kept[allowed]
             self._stats.count(**found.lost, lost_mask=~allowed)
@@ -104,7 +104,7 @@ class CameraTracker:
             after = Tracks.of(image, stamp_ns, before.ids[kept], points, normalized)
             self._moving.next_frame()
             moves = self._moving.among(after.ids)
-            tested = np.flatnonzero(~moves)
+            tested = (~moves).nonzero()[0]
             starts = self._unrolled(before).take(kept[tested], axis=0)
             places = starts, self._unrolled(after).take(tested, axis=0)
             scale = self._tolerance_scale(before.pixels.take(kept, axis=0), after.pixels)
@@ -126,7 +126,9 @@ class CameraTracker:
             after = self._recovered(before, after)
         alone = apart(np.ascontiguousarray(after.pixels), _MERGE_DISTANCE_PX)
         self._stats.count(lost_merged=~alone)
-        return self._with_residual_flow(before, after.select(alone))
+        if not alone.all():
+            after = after.select(alone)
+        return self._with_residual_flow(before, after)
 
     def replenish(self, before: Tracks, after: Tracks, next_id: int) -> Tracks:
         """Add new features where an image has few.
@@ -249,7 +251,7 @@ class CameraTracker:
         def inliers(rows: IntArray) -> BoolArray:
             return self._inliers(origins[rows], points[rows], scale)
 
-        for group in coherent_groups(inliers, np.flatnonzero(~good), len(good)):
+        for group in coherent_groups(inliers, (~good).nonzero()[0], len(good)):
             good[group] = True
         return good
 

@@ -84,8 +84,8 @@ class _Extracted:
 
     def within_quotas(self, good: BoolArray) -> BoolArray:
         """Of the good points (N,) of each group the first ones, as many as are wanted."""
-        count = np.cumsum(good)
-        before = np.concatenate([[0], count])[np.searchsorted(self.group, self.group)]
+        count = good.cumsum()
+        before = (count - good)[self.group.searchsorted(self.group)]  # of the first of the group
         wanted: BoolArray = good & (count - before <= self.quotas[self.group])
         return wanted
 
@@ -163,11 +163,11 @@ class FeatureExtractor:
             quota = min(missing, share)
             cell = self._cells[i]
             if self._detector.local:
-                best = self._in_cell(image, free, cell, surplus * quota)
+                best = self._in_cell(image, free, cell, surplus * quota).pixels + cell.origin
             else:
                 whole = self._whole(image, free) if whole is None else whole
-                best = whole.select(_inside(whole.pixels, cell))
-            pixels = best.pixels[self._claim(free, best.pixels, surplus * quota)]
+                best = whole.pixels[_inside(whole.pixels, cell)]
+            pixels = best[self._claim(free, best, surplus * quota)]
             if len(pixels) < quota:
                 self._rest[i] = _REST_FRAMES
             found.append(pixels)
@@ -194,6 +194,7 @@ class FeatureExtractor:
         for cell in self._cells:
             if whole is None:
                 best = self._in_cell(image, self._allowed, cell, share)
+                best = best.at(best.pixels + cell.origin)
             else:
                 best = whole.select(_inside(whole.pixels, cell))
             found.append(best.select(spread(best.pixels, share, self._distance_px)))
@@ -221,15 +222,17 @@ class FeatureExtractor:
         missing = self._missing(occupied)
         if missing <= 0:
             return []
-        apart = self._count(self._apart)
-        counts = self._count(occupied) - apart
-        of_the_world = apart <= counts
+        counts, of_the_world = self._count(occupied), np.ones(len(self._cells), np.bool_)
+        if len(self._apart):
+            apart = self._count(self._apart)
+            counts -= apart
+            of_the_world = apart <= counts
         share = -(-self._config.max_features // max(int(np.count_nonzero(of_the_world)), 1))
         # No cell rests while many features are missing, e.g. after the lens was covered
         awake = (self._rest == 0) | (2 * missing > self._config.max_features)
         wanting = (counts < share) & awake & of_the_world
-        cells = np.flatnonzero(wanting)
-        emptiest_first = cells[np.argsort(counts[cells], kind="stable")]
+        cells = wanting.nonzero()[0]
+        emptiest_first = cells[counts[cells].argsort(kind="stable")]
         shares = share - counts[emptiest_first]
         return list(zip(emptiest_first.tolist(), shares.tolist(), strict=True))
 
@@ -264,15 +267,14 @@ class FeatureExtractor:
         )
 
     def _in_cell(self, image: Image, free: Image, cell: _Cell, count: int) -> Keypoints:
-        """The best keypoints of a cell, best first."""
+        """The best keypoints of a cell, best first, at pixels of its surroundings."""
         own = free[cell.own]
         if cv2.countNonZero(own) == 0:
             return Keypoints.concatenate([])
         patch = np.ascontiguousarray(image[cell.around])
         allowed = np.zeros(patch.shape, np.uint8)
         allowed[cell.inner] = own
-        found = self._detector.detect(patch, allowed, count, self._distance_px)
-        return found.at(found.pixels + cell.origin)
+        return self._detector.detect(patch, allowed, count, self._distance_px)
 
 
 def _disk(radius: int) -> IntArray:

@@ -91,10 +91,14 @@ class _Pyramid:
 
     def reach(self, levels: int) -> None:
         """Make so many levels, if they are not there."""
-        for level in range(self._made, levels):
-            smaller = halved(self.image, self.halvings, level + 1)
-            cv2.pyrDown(halved(self.image, self.halvings, level), smaller)
-        self._made = max(self._made, levels)
+        if levels <= self._made:
+            return
+        larger = halved(self.image, self.halvings, self._made)
+        for level in range(self._made + 1, levels + 1):
+            smaller = halved(self.image, self.halvings, level)
+            cv2.pyrDown(larger, smaller)
+            larger = smaller
+        self._made = levels
 
 
 class LucasKanade:
@@ -138,8 +142,10 @@ class LucasKanade:
 
     def _pyramid(self, image: Image, levels: int) -> _Pyramid:
         """The pyramid of an image, with at least so many levels."""
-        found = next((pyramid for pyramid in self._pyramids if pyramid.is_of(image)), None)
-        if found is None:
+        for found in self._pyramids:
+            if found.is_of(image):
+                break
+        else:
             found = _Pyramid(image, max(levels, self._levels))
             self._pyramids.append(found)
         found.reach(levels)
@@ -210,7 +216,7 @@ class CornerTracking:
         # looked for again like the features without one.
         guided = min(_GUIDED_LEVELS, self._levels)
         for levels, tried in ((guided, guess.trusted), (self._levels, None)):
-            rows = np.flatnonzero(~good if tried is None else tried)
+            rows = (~good if tried is None else tried).nonzero()[0]
             if len(rows) == 0:
                 continue
             start = before.pixels.take(rows, axis=0)
@@ -239,7 +245,7 @@ class CornerTracking:
         flow = self._lucas_kanade.flow(after.image, before.image, points, guess, _GUIDED_LEVELS)
         limit_px = _VERIFICATION * self._tolerance_px(points, flow.points)
         good = found.within_quotas(flow.found & (flow.error_px < limit_px))
-        chosen = np.flatnonzero(good)
+        chosen = good.nonzero()[0]
         origins = flow.points.take(chosen, axis=0)
         return Candidates(points.take(chosen, axis=0), origins, _VERIFICATION)
 

@@ -74,7 +74,7 @@ class ReferencePatches:
         self._image += 1
         self._remove(self._last_tracked[self._slots] < self._image - _KEPT_IMAGES)
         own = self._slots_of(before)
-        rows = np.flatnonzero(good & (own >= 0))
+        rows = (good & (own >= 0)).nonzero()[0]
         slots = own[rows]
         places, warps = points[rows].astype(np.float64), self._warps[slots]
         found, correlations = align_patches(
@@ -83,11 +83,11 @@ class ReferencePatches:
             *(places, _ITERATIONS, _STEP_PX),
         )
         found &= correlations > _LEAST_CORRELATION
-        lost = np.flatnonzero(~found)
+        lost = (~found).nonzero()[0]
         self._warps[slots[lost]] = warps[lost]
         changed = _view_has_changed(self._warps[slots])
         found &= ~changed
-        points, placed = points.copy(), np.flatnonzero(found)
+        points, placed = points.copy(), found.nonzero()[0]
         points[rows[placed]] = places[placed]
         self._last_tracked[slots] = self._image
         refusals = np.where(found, 0, self._refusals[slots] + 1)
@@ -109,12 +109,13 @@ class ReferencePatches:
     def _slots_of(self, tracks: Tracks) -> IntArray:
         """Slots (N,) of the patches of features, -1 where there is none; takes those missing."""
         assert tracks.image is not None
-        slots = np.full(len(tracks), -1)
         if len(self._ids):
             at = self._ids.searchsorted(tracks.ids)
             same = self._ids.take(at, mode="clip") == tracks.ids
             slots = np.where(same, self._slots.take(at, mode="clip"), -1)
-        new = np.flatnonzero(slots < 0)
+        else:
+            slots = np.full(len(tracks), -1)
+        new = (slots < 0).nonzero()[0]
         if len(new):
             slots[new] = self._add(tracks.image, tracks.ids[new], tracks.pixels[new])
         return slots
@@ -125,7 +126,7 @@ class ReferencePatches:
         Returns:
             (N,) where they are; -1 where none was taken.
         """
-        within = np.flatnonzero(inside(pixels, image.shape, _HALF + 3))
+        within = inside(pixels, image.shape, _HALF + 3).nonzero()[0]
         slots = self._taken(len(within))
         room = self._templates, self._systems, self._warps
         middles = np.ascontiguousarray(pixels[within], np.float32)
@@ -134,7 +135,7 @@ class ReferencePatches:
         taken, slots = within[textured], slots[textured]
         self._refusals[slots], self._last_tracked[slots] = 0, self._image
         kept = np.concatenate([self._ids, ids[taken]])
-        order = np.argsort(kept, kind="stable")
+        order = kept.argsort(kind="stable")
         self._ids, self._slots = kept[order], np.concatenate([self._slots, slots])[order]
         result = np.full(len(ids), -1)
         result[taken] = slots

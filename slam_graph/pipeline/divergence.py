@@ -62,10 +62,9 @@ def check_sane(state: NavState, config: RunConfig) -> None:
     """
     limits = config.limits
     variances = [0.0] * 15 if state.covariance is None else state.covariance.diagonal().tolist()
-    pose, velocity = state.world_T_body.matrix(), state.velocity.tolist()
+    pose, velocity = state.world_T_body.matrix().ravel().tolist(), state.velocity.tolist()
     gyro, accel = state.gyro_bias.tolist(), state.accel_bias.tolist()
-    known = (*velocity, *gyro, *accel, *variances)
-    if not (np.isfinite(pose).all() and all(map(math.isfinite, known))):
+    if not all(map(math.isfinite, (*pose, *velocity, *gyro, *accel, *variances))):
         raise DivergenceError(f"diverged at frame {state.stamp_ns}: the state is not finite")
     sigma_m = math.sqrt(max(*variances[3:6], 0.0))
     for what, value, limit in (

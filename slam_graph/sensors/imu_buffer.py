@@ -71,8 +71,9 @@ class ImuBuffer:
         if len(t) == 0:  # nothing known: the caller asks `largest_gap_s` first
             return ImuData(np.array([start_ns, end_ns]), np.zeros((2, 3)), np.zeros((2, 3)))
         inside = slice(int(t.searchsorted(start_ns, side="right")), int(t.searchsorted(end_ns)))
-        stamps = np.concatenate([[start_ns], t[inside], [end_ns]])
-        gyro, accel = np.empty((2, len(stamps), 3))
+        count = max(inside.stop - inside.start, 0) + 2
+        stamps, (gyro, accel) = np.empty(count, np.int64), np.empty((2, count, 3))
+        stamps[0], stamps[1:-1], stamps[-1] = start_ns, t[inside], end_ns
         gyro[1:-1], accel[1:-1] = self.data.gyro[inside], self.data.accel[inside]
         gyro[0], accel[0] = self._at(start_ns, start_ns)
         gyro[-1], accel[-1] = self._at(end_ns, start_ns)

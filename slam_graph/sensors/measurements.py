@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence as PySequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import gtsam
 import numpy as np
@@ -246,6 +246,7 @@ class FeatureFrame:
     cameras: tuple[FeatureObservations, ...]
     outliers: tuple[FeatureObservations, ...] = ()
     moving: tuple[FeatureObservations, ...] = ()
+    _ids: IntArray | None = field(default=None, init=False, repr=False)
 
     @property
     def features(self) -> int:
@@ -255,7 +256,11 @@ class FeatureFrame:
     @property
     def ids(self) -> IntArray:
         """The features (N,) that any camera sees, ascending."""
-        return ascending_union(*(camera.ids for camera in self.cameras))
+        if self._ids is None:  # several parts of the back end ask for them
+            ids = ascending_union(*(camera.ids for camera in self.cameras))
+            object.__setattr__(self, "_ids", ids)
+        assert self._ids is not None
+        return self._ids
 
     @property
     def whole(self) -> FeatureFrame:

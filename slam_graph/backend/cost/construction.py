@@ -159,14 +159,14 @@ class CostConstruction:
         in_state = window.state_features[is_in(window.state_features, waiting)]
         cost.landmarks = window.tracks.observations(in_state)
         cost.tracks = self._selection.new_features(
-            window, poses, len(in_state), self._dynamic, removals
+            window, cost.state, poses, len(in_state), self._dynamic, removals
         )
         offered = cost.tracks
         gate, linear = self._apply_gate(window, cost, predicted, removals)
         if not self._features.relinearized:
             # a pose that no waiting observation refers to has nothing more to give
-            used = np.ones(len(cost.tracks.points) if cost.tracks is not None else 0, np.bool_)
-            gone = ascending_union(removals.ids(), window.state_features, cost.ids_of(used))
+            used = np.zeros(0, np.int64) if cost.tracks is None else cost.tracks.obs.ids
+            gone = ascending_union(removals.ids(), window.state_features, used)
             useful = window.tracks.frames(without=gone)
             kept = [i for i in poses.kept if i in useful]
             poses = replace(poses, kept=kept, keyframes=poses.keyframes.intersection(kept))

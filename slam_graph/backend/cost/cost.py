@@ -294,7 +294,7 @@ class Cost:
             return [leading, pose_rows(rest, None, none, none, (of_state, none), size)]
         assert isinstance(linear.tracks, SummedFeatures)
         columns = of_state, layout.indices(self.rig.keys_of(self.tracks.obs))
-        new = np.flatnonzero(self.tracks.in_state)
+        new = self.tracks.in_state.nonzero()[0]
         own = layout.indices(landmark_keys(self.tracks.obs.ids[new]))
         return [leading, pose_rows(rest, linear.tracks, new, own, columns, size)]
 

@@ -33,6 +33,7 @@ from slam_graph.backend.cost.selection_policies import (
 )
 from slam_graph.backend.cost.triangulation import triangulate
 from slam_graph.backend.policies import CostPolicy
+from slam_graph.backend.solve.state import State
 from slam_graph.backend.window import Window
 from slam_graph.diagnostics import Diagnostics
 
@@ -77,6 +78,7 @@ class FeatureSelection:
     def new_features(
         self,
         window: Window,
+        state: State,
         poses: PoseSelection,
         in_state: int,
         dynamic: IntArray,
@@ -86,6 +88,7 @@ class FeatureSelection:
 
         Args:
             window: with all waiting observations.
+            state: of the cost, where it is as in the window.
             poses: which past poses stay.
             in_state: number of features of the state that the current frame sees.
             dynamic: ids (N,) of features that must not be used, ascending.
@@ -99,7 +102,7 @@ class FeatureSelection:
             return None
         obs = window.tracks.observations(ids)
         lasting = is_in(ids, choice.lasting)
-        points, good = self._points(window, obs, lasting)
+        points, good = self._points(window, state, obs, lasting)
         entering = is_in(ids, choice.entering(ids[good], room))
         # a lasting one that is not good may yet become so
         used = is_in(ids, choice.used) & ~entering & (~lasting | good)
@@ -121,7 +124,9 @@ class FeatureSelection:
         tracks, policy = window.tracks, self.policy
         ids, lengths = tracks.lengths()
         removals.add_features(Outcome.DYNAMIC, dynamic)
-        outside = ~is_in(ids, window.state_features) & ~is_in(ids, dynamic)
+        outside = ~is_in(ids, window.state_features)
+        if len(dynamic):
+            outside &= ~is_in(ids, dynamic)
         ids, lengths = ids[outside], lengths[outside]
         live = is_in(ids, tracks.seen)
         lasting = live & (lengths >= policy.frames_before_state) & (room > 0)
@@ -138,20 +143,20 @@ class FeatureSelection:
         return _Candidates(used, ids[lasting], lengths[lasting])
 
     def _points(
-        self, window: Window, obs: Observations, lasting: BoolArray
+        self, window: Window, state: State, obs: Observations, lasting: BoolArray
     ) -> tuple[FloatArray, BoolArray]:
         """Positions (J, 3) of features, those of the last step where there are, and their worth."""
         known_ids, known_points = window.kept_points
         good = is_in(obs.ids, known_ids)
         points = np.zeros((len(obs.ids), 3))
-        points[good] = known_points[np.searchsorted(known_ids, obs.ids[good])]
-        here = window.state.frames.atPose3(X(window.frame)).translation()
+        points[good] = known_points[known_ids.searchsorted(obs.ids[good])]
+        here = state.frames.atPose3(X(window.frame)).translation()
         # steps may have sent a feature with little parallax to infinity
         away = np.sqrt(np.add.reduce((points - here) ** 2, axis=1))
         good &= away < self.config.triangulation.max_depth_m
         if not good.all():
-            new, rig = ~good, self.rig.at(window.state)
-            poses = rig.when_taken(obs.frames, *window.state.poses(obs.frames))
+            new, rig = ~good, self.rig.at(state)
+            poses = rig.when_taken(obs.frames, *state.poses(obs.frames))
             observed = rig.renormalized(obs.subset(new))
             result = triangulate(observed, rig, *poses, self.config.triangulation)
             noise = float(np.max(self.pixels.sigma_px)) / rig.cameras[0].fx
@@ -170,5 +175,6 @@ def _longest(ids: IntArray, lengths: IntArray, count: int) -> IntArray:
     """The `count` features with the longest tracks, ascending ids."""
     if count >= len(ids):
         return ids
-    order = np.argsort(-lengths, kind="stable")[:count]
-    return np.sort(ids[order])
+    longest = ids[(-lengths).argsort(kind="stable")[:count]]
+    longest.sort()
+    return longest

@@ -214,7 +214,7 @@ class FeatureTracks:
             places[0, rows], places[1, rows] = camera.pixels, camera.normalized
         self.seen = frame.ids
         self.added += sum(new)
-        order = np.argsort(numbers[0], kind="stable")
+        order = numbers[0].argsort(kind="stable")
         self._numbers, self._places = numbers.take(order, axis=1), places.take(order, axis=1)
         self._group()
 
@@ -250,12 +250,12 @@ class FeatureTracks:
         for outcome, ids in features:
             gone = is_in(self._features, ids) & stays
             self._count(outcome, counts[gone].sum())
-            stays &= ~gone
+            stays ^= gone
         left &= stays.repeat(self._counts)
         if frames is not None:
-            late = left & ~_is_among(self._frames, frames)
-            self._count(Outcome.POSE_LEFT, np.count_nonzero(late))
-            left &= ~late
+            here = left & _is_among(self._frames, frames)
+            self._count(Outcome.POSE_LEFT, np.count_nonzero(left) - np.count_nonzero(here))
+            left = here
         self._select(left.nonzero()[0])
 
     def _count(self, outcome: Outcome, count: int | np.int64) -> None:
@@ -290,8 +290,8 @@ class FeatureTracks:
         """The frames of all waiting observations but those of some features (ascending ids)."""
         if not len(self):
             return set()
-        rows, first = ~self._rows_of_features(without), self._frames.min()
-        return set((np.flatnonzero(np.bincount(self._frames[rows] - first)) + first).tolist())
+        rows, first = (~is_in(self._features, without)).repeat(self._counts), self._frames.min()
+        return set((np.bincount(self._frames[rows] - first).nonzero()[0] + first).tolist())
 
     def ids_waiting(self) -> IntArray:
         """All features with waiting observations, ascending."""
@@ -348,10 +348,10 @@ class FeatureTracks:
         if frames is not None:
             wanted &= _is_among(self._frames, frames)
         rows = wanted.nonzero()[0]
-        features, numbers, cameras = self._numbers.take(rows, axis=1)
+        _, numbers, cameras = self._numbers.take(rows, axis=1)
         pixels, normalized = self._places.take(rows, axis=1)
         order, frame = _numbered(numbers)
-        feature = ids.searchsorted(features)
+        feature = ids.searchsorted(self._features).repeat(self._counts).take(rows)
         return Observations(ids, tuple(order.tolist()), feature, frame, cameras, pixels, normalized)
 
 
@@ -376,7 +376,7 @@ def _is_among(frames: IntArray, some: Sequence[int]) -> BoolArray:
 
 def is_in(values: IntArray, ascending: IntArray) -> NDArray[np.bool_]:
     """Which values (N,) are among some ascending ones."""
-    if len(ascending) == 0:
+    if len(ascending) == 0 or len(values) == 0:
         return np.zeros(len(values), np.bool_)
     try:
         return are_among(values, ascending)

@@ -56,9 +56,10 @@ class Innovations:
             largest: (J,) what the gate lets through, the same where the degrees of freedom are.
             passed: (J,) what it let through.
         """
-        entered, counts = distances[passed], np.bincount(dof[passed])
-        degrees, limits = np.flatnonzero(counts), np.zeros(len(counts))
-        limits[dof[passed]] = largest[passed]
+        entered, passed_dof = distances[passed], dof[passed]
+        counts = np.bincount(passed_dof)
+        degrees, limits = counts.nonzero()[0], np.empty(len(counts))
+        limits[passed_dof], counts = largest[passed], counts[degrees]
         kinds = zip(degrees.tolist(), limits[degrees].tolist(), strict=True)
         means = np.array([_mean_below(*kind) for kind in kinds])
         return Innovations(
@@ -67,8 +68,8 @@ class Innovations:
             float(distances.sum()),
             int(dof.sum()),
             float(entered.sum()),
-            int(degrees @ counts[degrees]),
-            float(means @ counts[degrees]),
+            int(degrees @ counts),
+            float(means @ counts),
         )
 
     @staticmethod

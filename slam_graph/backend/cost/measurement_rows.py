@@ -45,8 +45,7 @@ def state_feature_rows(
         Rows [A b] (m, n + 1), at most three for each feature, triangular in its columns and in the
         order of these; and rows (K, k + 1) over `columns`, at most as many as these.
     """
-    counts, order = np.bincount(obs.feature, minlength=len(of_points)), np.argsort(of_points)
-    with_feature = np.minimum(2 * counts, POINT_DIM)
+    with_feature, order = np.minimum(2 * obs.counts, POINT_DIM), of_points.argsort()
     leading = np.zeros((int(with_feature.sum()), size + 1), order="F")
     rest = np.empty((2 * len(obs) - len(leading), len(columns) + 1))
     parts = linear.r, linear.by_pose, linear.by_point, linear.by_calibration

@@ -148,13 +148,14 @@ class StandstillDetector:
         if min(len(first), len(second), len(third)) < MIN_FEATURES:
             return None
         ids, common = first.ids, ~is_in(first.ids, self.dynamic)
-        places = [np.minimum(f.ids.searchsorted(ids), len(f) - 1) for f in (second, third)]
+        places = [f.ids.searchsorted(ids) for f in (second, third)]
         for frame, rows in zip((second, third), places, strict=True):
-            common &= frame.ids[rows] == ids
-        if np.count_nonzero(common) < MIN_FEATURES:
+            common &= frame.ids.take(rows, mode="clip") == ids
+        here = common.nonzero()[0]
+        if len(here) < MIN_FEATURES:
             return None
-        change = third.pixels[places[1][common]] + first.pixels[common]
-        change -= 2.0 * second.pixels[places[0][common]]
+        change = third.pixels.take(places[1][here], axis=0) + first.pixels.take(here, axis=0)
+        change -= 2.0 * second.pixels.take(places[0][here], axis=0)
         change -= median(change)
         # a second difference of independent errors has the variance (1 + 4 + 1) σ²
         return float(median(np.abs(change).ravel())) / (_NORMAL_MEDIAN * math.sqrt(6.0))
@@ -256,9 +257,10 @@ def _common_motion_px(
 
     Both are in ascending order of ids.
     """
-    common = is_in(after.ids, before.ids)
+    common = is_in(after.ids, before.ids).nonzero()[0]
     ids = after.ids[common]
-    return ids, after.pixels[common] - before.pixels[np.searchsorted(before.ids, ids)]
+    there = before.ids.searchsorted(ids)
+    return ids, after.pixels.take(common, axis=0) - before.pixels.take(there, axis=0)
 
 
 def zero_velocity_factors(i: int, j: int) -> list[gtsam.NonlinearFactor]:

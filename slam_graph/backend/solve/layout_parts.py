@@ -49,7 +49,7 @@ class LayoutParts:
         columns = (dims.cumsum() - dims)[points][:, None] + _POINT_COLUMNS
         ends = dims[rest].cumsum().tolist()
         slices = list(map(slice, [0, *ends[:-1]], ends))
-        of_others = np.flatnonzero(np.repeat(rest, dims))
+        of_others = rest.repeat(dims).nonzero()[0]
         return LayoutParts(
             keys[rest].tolist(), slices, of_others, keys[points] - FIRST_POINT, columns
         )
