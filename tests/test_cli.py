@@ -89,12 +89,6 @@ def test_version() -> None:
     assert (done.returncode, done.stdout) == (0, f"slam-graph {__version__}\n")
 
 
-def test_the_package_is_the_command() -> None:
-    command = [sys.executable, "-m", "slam_graph", "--version"]
-    done = subprocess.run(command, check=True, capture_output=True, text=True, timeout=HANG_S)
-    assert done.stdout == f"slam-graph {__version__}\n"
-
-
 @pytest.mark.parametrize(
     "arguments",
     [

@@ -10,9 +10,9 @@ from dataclasses import dataclass
 import gtsam
 import numpy as np
 
-from slam_graph.arrays import FloatArray
-from slam_graph.frontend import epipolar_error
+from slam_graph.arrays import FloatArray, skew
 from slam_graph.geometry import Trajectory, interpolate
+from slam_graph.kernels.epipolar import sampson_distances
 from slam_graph.sensors import AidingData, FeatureFrame, FeatureObservations, ImuData, Rig
 
 _GAP_FRAMES = 5
@@ -124,7 +124,7 @@ class TrackQuality:
         for mounted, a, b in zip(self._rig.cameras, before.cameras, after.cameras, strict=True):
             world_T_a = world_T_before * mounted.body_T_camera
             world_T_b = world_T_after * mounted.body_T_camera
-            error = epipolar_error(world_T_b.between(world_T_a), *_common(a, b))
+            error = _epipolar_error(world_T_b.between(world_T_a), a, b)
             self._epipolar_px.append(error * mounted.camera.fx)
 
     def _across(self, frame: FeatureFrame) -> None:
@@ -133,11 +133,14 @@ class TrackQuality:
             return
         first, second = self._rig.cameras[:2]
         second_T_first = second.body_T_camera.between(first.body_T_camera)
-        error = epipolar_error(second_T_first, *_common(frame.cameras[0], frame.cameras[1]))
+        error = _epipolar_error(second_T_first, *frame.cameras[:2])
         self._stereo_px.append(error * first.camera.fx)
 
 
-def _common(a: FeatureObservations, b: FeatureObservations) -> tuple[FloatArray, FloatArray]:
-    """Normalised coordinates (N, 2) of the features in both."""
+def _epipolar_error(
+    b_T_a: gtsam.Pose3, a: FeatureObservations, b: FeatureObservations
+) -> FloatArray:
+    """Sampson's distances (N,) of the features in both from their epipolar lines, normalised."""
     _, in_a, in_b = np.intersect1d(a.ids, b.ids, assume_unique=True, return_indices=True)
-    return a.normalized[in_a], b.normalized[in_b]
+    essential = skew(b_T_a.translation()) @ b_T_a.rotation().matrix()
+    return sampson_distances(essential, a.normalized[in_a], b.normalized[in_b])

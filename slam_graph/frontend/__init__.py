@@ -15,9 +15,9 @@ __all__ = [
     "Feedback",
     "Frontend",
     "FrontendConfig",
+    "Image",
     "Keypoints",
     "build_frontend",
-    "epipolar_error",
 ]
 
 if TYPE_CHECKING:
@@ -30,8 +30,7 @@ if TYPE_CHECKING:
         FrontendConfig,
     )
     from slam_graph.frontend.frontend_protocol import Feedback, Frontend, build_frontend
-    from slam_graph.frontend.keypoints import Keypoints
-    from slam_graph.frontend.outliers import epipolar_error
+    from slam_graph.frontend.keypoints import Image, Keypoints
 else:
     __getattr__, __dir__ = lazy_exports(
         __name__,
@@ -40,7 +39,6 @@ else:
             "detectors": ("Detector",),
             "frontend_config": ("DESCRIPTORS", "DETECTORS", "FRONTENDS", "FrontendConfig"),
             "frontend_protocol": ("Feedback", "Frontend", "build_frontend"),
-            "keypoints": ("Keypoints",),
-            "outliers": ("epipolar_error",),
+            "keypoints": ("Image", "Keypoints"),
         },
     )

@@ -281,11 +281,6 @@ def epipolar_distance(E: FloatArray, m_a: FloatArray, m_b: FloatArray) -> FloatA
     return sampson_distances(_contiguous(E), _contiguous(m_a), _contiguous(m_b))
 
 
-def epipolar_error(b_T_a: gtsam.Pose3, m_a: FloatArray, m_b: FloatArray) -> FloatArray:
-    """`epipolar_distance` (N,) of matches (N, 2) between two views whose relative pose is known."""
-    return epipolar_distance(essential_matrix(b_T_a), m_a, m_b)
-
-
 def triangulated_depths(b_T_a: gtsam.Pose3, m_a: FloatArray, m_b: FloatArray) -> FloatArray:
     """Depths (N, 2) in a and in b of the closest points of the two rays, in metres.
 

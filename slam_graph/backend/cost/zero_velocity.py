@@ -47,10 +47,9 @@ _SAMPLING_SIGMAS = 3.0
 _NO_NOISE = 1e-6
 """Probability that noise alone moves a feature as far as one that counts as dynamic."""
 
-_GAINED_SPEED = VELOCITY_SIGMA
-"""Change of velocity, beyond what the noise of the IMU gives, that ends a standstill, m/s: what is
-not seen should be within the σ of the factor. It sees a take-off that noisy images do not see yet.
-"""
+_GAINED_SPEED = 0.02
+"""Change of velocity, beyond what the noise of the IMU gives, that ends a standstill, m/s. It sees
+a take-off that noisy images do not see yet."""
 
 _BRIDGE = 2.0
 """Largest value of a Brownian bridge of unit variance: exceeded with a probability of 7e-4."""
