@@ -81,11 +81,8 @@ def ascending_union(*parts: IntArray) -> IntArray:
     some = [part for part in parts if len(part)]
     if not some:
         return np.zeros(0, np.int64)
-    if len(some) > 1:
-        values = np.concatenate(some)
-        values.sort()
-    else:
-        values = np.sort(some[0])
+    values = np.concatenate(some)
+    values.sort()
     first = np.empty(len(values), np.bool_)
     first[0] = True
     np.not_equal(values[1:], values[:-1], out=first[1:])

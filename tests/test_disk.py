@@ -52,9 +52,16 @@ class Stock:
         )
 
     def command(
-        self, arguments: list[str], folder: Path, limit: int | None = None
+        self,
+        arguments: list[str],
+        folder: Path,
+        limit: int | None = None,
+        fonts: Path | None = None,
     ) -> subprocess.CompletedProcess[str]:
-        """Run a command; its files may have so many bytes. Matplotlib looks for fonts only once."""
+        """Run a command; its files may have so many bytes.
+
+        Matplotlib looks for fonts only once, unless the folder for what it found is another one.
+        """
 
         def bound() -> None:
             signal.signal(signal.SIGXFSZ, signal.SIG_IGN)  # to write gives an error then
@@ -68,7 +75,7 @@ class Stock:
             text=True,
             timeout=HANG_S,
             preexec_fn=bound,
-            env={**os.environ, "MPLCONFIGDIR": str(self.fonts)},
+            env={**os.environ, "MPLCONFIGDIR": str(fonts or self.fonts)},
         )
 
 
@@ -136,6 +143,11 @@ def test_a_full_disk_leaves_nothing_half_written(stock: Stock, tmp_path: Path, n
     check_refused(done)
     assert not [path for path in place.rglob("*") if path.name.startswith(".")]
     assert not list(place.rglob("latest"))
+
+
+def test_a_disk_that_is_too_full_for_fonts_is_no_traceback(stock: Stock, tmp_path: Path) -> None:
+    arguments = COMMANDS["frontend"](stock, tmp_path)
+    check_refused(stock.command(arguments, tmp_path, limit=SMALL, fonts=tmp_path / "fonts"))
 
 
 @pytest.mark.skipif(not os.path.exists("/dev/full"), reason="there is no /dev/full")

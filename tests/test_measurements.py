@@ -4,6 +4,7 @@
 
 import gtsam
 import numpy as np
+import pytest
 
 from slam_graph.sensors.measurements import FeatureFrame, FeatureObservations, ImuData
 
@@ -21,6 +22,17 @@ def test_features_of_a_frame() -> None:
     assert [camera.ids.tolist() for camera in only.cameras] == [[7], [3]]
     assert all(len(camera) == 0 for camera in frame.only(np.zeros(0, np.int64)).cameras)
     assert FeatureFrame(0, ()).ids.tolist() == []
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("pixels", [[np.inf, -np.inf], [1e308, 1e308], [np.nan, 0.0]])
+def test_what_is_not_finite_is_left_out(pixels: list[float]) -> None:
+    seen = np.array([pixels, [3.0, 4.0]])
+    frame = FeatureFrame(0, (FeatureObservations(np.array([5, 8]), seen, np.zeros((2, 2))),))
+    usable, left_out = frame.usable(1)
+    finite = np.isfinite(seen).all(axis=1)
+    assert usable.ids.tolist() == np.array([5, 8])[finite].tolist()
+    assert left_out == np.count_nonzero(~finite)
 
 
 def test_chained_rotations() -> None:

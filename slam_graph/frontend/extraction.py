@@ -267,7 +267,7 @@ class FeatureExtractor:
         )
 
     def _in_cell(self, image: Image, free: Image, cell: _Cell, count: int) -> Keypoints:
-        """The best keypoints of a cell, best first, at pixels of its surroundings."""
+        """The best keypoints of a cell, best first, in pixels from `cell.origin`."""
         own = free[cell.own]
         if cv2.countNonZero(own) == 0:
             return Keypoints.concatenate([])

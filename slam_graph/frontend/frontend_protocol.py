@@ -9,6 +9,8 @@ from __future__ import annotations
 
 import time
 from collections import defaultdict
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from typing import Literal, Protocol, runtime_checkable
 
@@ -40,23 +42,12 @@ class FrameStats(defaultdict[str, float]):
         for name, selected in features.items():
             self[name] += int(np.count_nonzero(selected))
 
-    def timed(self, stage: str) -> _Timed:
-        """Add the time of a block to a stage; nothing is added where it fails."""
-        return _Timed(self, stage)
-
-
-class _Timed:
-    """Times a block; a generator takes several times as long."""
-
-    def __init__(self, stats: FrameStats, stage: str) -> None:
-        self._stats, self._stage = stats, stage
-
-    def __enter__(self) -> None:
-        self._start_s = time.perf_counter()
-
-    def __exit__(self, kind: object, error: object, traceback: object) -> None:
-        if kind is None:
-            self._stats[self._stage] += (time.perf_counter() - self._start_s) * 1e3
+    @contextmanager
+    def timed(self, stage: str) -> Iterator[None]:
+        """Add the time of a block to a stage."""
+        start = time.perf_counter()
+        yield
+        self[stage] += (time.perf_counter() - start) * 1e3
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,7 +18,12 @@ __all__ = ["triangularize_features", "triangularize_features_numpy"]
 def _reflect(A: FloatArray, B: FloatArray, column: int, v: FloatArray, product: FloatArray) -> None:
     """The reflection that zeroes a column of A (m, 3) below the diagonal; the same of B (m, n).
 
-    There is room for m and for max(3, n) numbers in `v` and `product`.
+    Args:
+        A: (m, 3).
+        B: (m, n).
+        column: which of A.
+        v: (m,) room for the reflection.
+        product: (max(3, n),) room for products with it.
     """
     rows = len(A)
     squares = 0.0

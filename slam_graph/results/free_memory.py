@@ -11,8 +11,8 @@ import sys
 def give_back() -> None:
     """Give free memory back to the system, where the C library is glibc.
 
-    It keeps what was freed for what may come, most of it until the program ends: the arrays that
-    files were made of (1.8 kB a state), or 9 MB of the thread that decoded the images.
+    It keeps what was freed for what may come, most of it until the program ends, as the arrays that
+    files were made of (1.8 kB a state).
     """
     if sys.platform.startswith("linux"):
         trim = getattr(ctypes.CDLL(None), "malloc_trim", None)

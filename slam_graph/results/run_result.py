@@ -364,7 +364,7 @@ class RunResult(RunSummary):
         for stamp_ns, graph in self.graphs.items():
             for name, text in graph.texts().items():
                 files.text(f"graph_{stamp_ns}_{name}", [text])
-        give_back()  # what the run and the files took: matplotlib needs 30 MB
+        give_back()  # what the run and the files took: Matplotlib takes 25 MB more
         with files.appearing("trajectory.png") as partial:
             self.plot().write(partial)
         if self.slam_map is not None:  # last: it is the file that a full disk is too small for

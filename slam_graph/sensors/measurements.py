@@ -255,7 +255,7 @@ class FeatureFrame:
 
     @property
     def ids(self) -> IntArray:
-        """The features (N,) that any camera sees, ascending."""
+        """The features (N,) that any camera sees, ascending. All callers share the array."""
         if self._ids is None:  # several parts of the back end ask for them
             ids = ascending_union(*(camera.ids for camera in self.cameras))
             object.__setattr__(self, "_ids", ids)
@@ -287,7 +287,7 @@ class FeatureFrame:
         """
         missing = (FeatureObservations.empty(),) * (cameras - len(self.cameras))
         seen = self.cameras + missing
-        with np.errstate(invalid="ignore"):  # ∞ - ∞
+        with np.errstate(invalid="ignore", over="ignore"):  # ∞ - ∞, a sum past all numbers
             finite = all(math.isfinite(c.pixels.sum() + c.normalized.sum()) for c in seen)
         if finite:
             return (FeatureFrame(self.stamp_ns, seen) if missing else self), 0

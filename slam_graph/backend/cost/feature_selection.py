@@ -88,7 +88,7 @@ class FeatureSelection:
 
         Args:
             window: with all waiting observations.
-            state: of the cost, where it is as in the window.
+            state: that of the cost, which still has the values of the window.
             poses: which past poses stay.
             in_state: number of features of the state that the current frame sees.
             dynamic: ids (N,) of features that must not be used, ascending.
@@ -125,8 +125,7 @@ class FeatureSelection:
         ids, lengths = tracks.lengths()
         removals.add_features(Outcome.DYNAMIC, dynamic)
         outside = ~is_in(ids, window.state_features)
-        if len(dynamic):
-            outside &= ~is_in(ids, dynamic)
+        outside &= ~is_in(ids, dynamic)
         ids, lengths = ids[outside], lengths[outside]
         live = is_in(ids, tracks.seen)
         lasting = live & (lengths >= policy.frames_before_state) & (room > 0)

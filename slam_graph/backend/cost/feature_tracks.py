@@ -290,7 +290,7 @@ class FeatureTracks:
         """The frames of all waiting observations but those of some features (ascending ids)."""
         if not len(self):
             return set()
-        rows, first = (~is_in(self._features, without)).repeat(self._counts), self._frames.min()
+        rows, first = ~self._rows_of_features(without), self._frames.min()
         return set((np.bincount(self._frames[rows] - first).nonzero()[0] + first).tolist())
 
     def ids_waiting(self) -> IntArray:

@@ -59,7 +59,8 @@ class Innovations:
         entered, passed_dof = distances[passed], dof[passed]
         counts = np.bincount(passed_dof)
         degrees, limits = counts.nonzero()[0], np.empty(len(counts))
-        limits[passed_dof], counts = largest[passed], counts[degrees]
+        limits[passed_dof] = largest[passed]
+        numbers = counts[degrees]
         kinds = zip(degrees.tolist(), limits[degrees].tolist(), strict=True)
         means = np.array([_mean_below(*kind) for kind in kinds])
         return Innovations(
@@ -68,8 +69,8 @@ class Innovations:
             float(distances.sum()),
             int(dof.sum()),
             float(entered.sum()),
-            int(degrees @ counts),
-            float(means @ counts),
+            int(degrees @ numbers),
+            float(means @ numbers),
         )
 
     @staticmethod

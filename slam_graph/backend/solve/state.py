@@ -47,7 +47,6 @@ INDEX_MASK = (1 << LETTER_SHIFT) - 1
 _COUNT_SHIFT = 16
 _DIMS_BY_CODE = {ord(letter): size for letter, size in DIMS.items()}
 _DISTORTION_CODE, _POSE_CODE = ord("d"), ord("x")
-_FIRST_KEYS = X(0), V(0), B(0)  # symbols have the index in their lowest bits
 
 
 def dim(key: int) -> int:
@@ -79,8 +78,7 @@ def letter_and_index(key: int) -> tuple[str, int]:
 
 def imu_state_keys(frame: int) -> tuple[int, int, int]:
     """Keys of the pose, velocity and bias of a frame."""
-    pose, velocity, bias = _FIRST_KEYS
-    return pose + frame, velocity + frame, bias + frame
+    return X(frame), V(frame), B(frame)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
