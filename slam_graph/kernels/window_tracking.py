@@ -13,11 +13,10 @@ from 64 bits; vectors of 16 bits take half the instructions of those of 32. A we
 64 h + l, and four of them sum up to 2^14, so the sum of their products with grey values v is S = 64
 H + L, where H = Σ h v and L = Σ l v are below 2^16. For derivatives, which have five bits more, S
 is 2048 A + B with 0 ≤ B < 2048: Scharr's sums of A and of B each fit into 16 bits with their sign.
+Grey values count from the middle of their range, so that more products can be added in 32 bits.
 """
 
 from __future__ import annotations
-
-import math
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,14 +30,15 @@ WINDOW_PX = 17
 """Side of the window."""
 
 _STRIDE = WINDOW_PX + 3
-_WEIGHT_BITS = 14
-_IMAGE_BITS = _WEIGHT_BITS - 5
-"""Bits that are rounded off: grey values in a window keep five after the point."""
+_WEIGHT_BITS, _IMAGE_BITS = 14, 14 - 5
+"""Bits of weights, and those rounded off: grey values in a window keep five after the point."""
 
 _LOW_BITS, _HALF_BITS = 6, 11
 """Bits of the lower part of a weight, and of that of a sum of products."""
 
 _ONE, _WHOLE = np.float32(1.0), np.float32(1 << _WEIGHT_BITS)
+_WITHOUT_FRACTION = np.float32(1 << 23)
+"""Added and taken away again it rounds as `rint`, without the cost of a call."""
 _SCALE = np.float32(1.0 / (1 << 20))
 """Of sums of products, so that the smallest eigenvalue is in OpenCV's unit."""
 
@@ -46,11 +46,12 @@ _SINGULAR = np.float32(np.finfo(np.float32).eps)
 _OSCILLATION_PX = 0.01
 """Two steps that cancel to within this end the iteration, half way between their ends."""
 
-_BLOCK = 64
-"""So many products are added in 32 bits: 64 * 4081 * 8160, derivative times grey, is below 2^31."""
+_MIDDLE = 255 << 4
+"""Grey value, with five bits after the point, from which those of windows count."""
 
-_LENGTH = -(-WINDOW_PX * _STRIDE // _BLOCK) * _BLOCK
-"""Of a window, made up to whole blocks."""
+_BLOCK, _LENGTH, _AROUND = 88, 4 * 88, 384
+"""So many products are added in 32 bits (88 * 4081 * 4081, of derivatives, is below 2^31). Length
+of a window, made up to whole blocks, and with the pixels around it: whole vectors of 16 numbers."""
 
 _VECTOR = 24
 """Pixels that are copied at once. The next row overwrites those that are too many."""
@@ -62,20 +63,26 @@ _at = np.uintp
 _Image = NDArray[np.uint8]
 _Halvings = NDArray[np.uint8]
 _Window = NDArray[np.int16]
-_Errors = NDArray[np.float32]
 _Pixels = NDArray[np.float32]
 _Weights = tuple[np.int32, np.int32, np.int32, np.int32]
 _Parts = tuple[np.uint16, np.uint16, np.uint16, np.uint16]
 
 
 @compiled()
+def _rounded(weight: np.float32) -> np.int32:
+    """The whole number nearest to a weight, which is not negative."""
+    return np.int32(weight + _WITHOUT_FRACTION - _WITHOUT_FRACTION)
+
+
+@compiled()
 def _cell(x: np.float32, y: np.float32) -> tuple[int, int, _Weights]:
     """The pixel (u, v) at the upper left of a place, and the weights of the four around it."""
-    u, v = math.floor(x), math.floor(y)
+    u, v = int(x), int(y)
+    u -= np.float32(u) > x  # negative ones were rounded up
+    v -= np.float32(v) > y
     a, b = x - np.float32(u), y - np.float32(v)
-    ul = np.int32(np.rint((_ONE - a) * (_ONE - b) * _WHOLE))
-    ur = np.int32(np.rint(a * (_ONE - b) * _WHOLE))
-    ll = np.int32(np.rint((_ONE - a) * b * _WHOLE))
+    ul, ur = _rounded((_ONE - a) * (_ONE - b) * _WHOLE), _rounded(a * (_ONE - b) * _WHOLE)
+    ll = _rounded((_ONE - a) * b * _WHOLE)
     return u, v, (ul, ur, ll, np.int32(_WHOLE - ul - ur - ll))
 
 
@@ -130,11 +137,12 @@ def _weighted(values: _Window, k: int, parts: _Parts) -> np.uint16:
 def _blend(values: _Window, weights: _Weights, out: _Window) -> None:
     """Bilinear interpolation between four grey values each, of which five bits are kept."""
     above, below = _split(weights)
-    half = _u16(1 << (_IMAGE_BITS - _LOW_BITS - 1))
+    bits = _IMAGE_BITS - _LOW_BITS
+    half = _u16((1 << (bits - 1)) - (_MIDDLE << bits))
     for k in range(_LENGTH):
         upper, lower = _weighted(values, k, above), _weighted(values, k, below)
-        total = _u16(_u16(upper + half) + _u16(lower >> _LOW_BITS))
-        out[_at(k)] = _u16(total >> (_IMAGE_BITS - _LOW_BITS))
+        total = _i16(_u16(upper + half) + _u16(lower >> _LOW_BITS))
+        out[_at(k)] = _i16(total >> bits)
 
 
 @compiled()
@@ -144,7 +152,7 @@ def _blend_in_halves(values: _Window, weights: _Weights, high: _Window, low: _Wi
     bits = _HALF_BITS - _LOW_BITS
     one = _u16(1 << bits)  # added, so that no sum is negative where a weight is
     rest, lowest = _u16((1 << bits) - 1), _u16((1 << _LOW_BITS) - 1)
-    for k in range(_LENGTH + 2 * _STRIDE + 2):
+    for k in range(_AROUND):
         upper, lower = _weighted(values, k, above), _weighted(values, k, below)
         total = _u16(_u16(upper + one) + _u16(lower >> _LOW_BITS))
         high[_at(k)] = _u16(total >> bits)
@@ -154,10 +162,11 @@ def _blend_in_halves(values: _Window, weights: _Weights, high: _Window, low: _Wi
 @compiled()
 def _middle(high: _Window, low: _Window, out: _Window) -> None:
     """The grey values of a window, with five bits after the point, by those of two halves."""
-    one, half = _i16(1), _i16(1 << (_IMAGE_BITS - 1))
+    bits = _HALF_BITS - _IMAGE_BITS
+    least, half = _i16(1 + (_MIDDLE >> bits)), _i16(1 << (_IMAGE_BITS - 1))
     for k in range(_LENGTH):
         m = _at(k + _STRIDE + 1)
-        upper = _i16(_i16(high[m] - one) << (_HALF_BITS - _IMAGE_BITS))
+        upper = _i16(_i16(high[m] - least) << bits)
         out[_at(k)] = _i16(upper + _i16(_i16(low[m] + half) >> _IMAGE_BITS))
 
 
@@ -245,7 +254,7 @@ def _track_level(
         target: the same level of the other.
         points: (N, 2) pixels of level 0 in `source`.
         guess: (N, 2) where to start, in pixels of this level of `target`; then what was found.
-        good: (N,) made false, on level 0, where a window has too little gradient or is outside.
+        good: (N,) made false, on level 0, where a window is outside or has too little gradient.
         level: of the pyramid; 0 is the image itself.
         iterations: most steps.
         step_px: a step that is not longer than this is the last one.
@@ -254,10 +263,9 @@ def _track_level(
     half, scale = np.float32((WINDOW_PX - 1) * 0.5), np.float32(1.0 / (1 << level))
     # One by one: Numba does not see that the rows of a larger array are contiguous
     size = _LENGTH + 4 * _STRIDE + _VECTOR
-    pixels, dx, dy = np.zeros(size, np.int16), np.zeros(size, np.int16), np.zeros(size, np.int16)
-    grey, moved = np.zeros(_LENGTH, np.int16), np.zeros(_LENGTH, np.int16)
-    gx, gy = np.zeros(_LENGTH, np.int16), np.zeros(_LENGTH, np.int16)
-    used = np.zeros(_LENGTH, np.int16)
+    pixels, dx, dy = np.zeros(size, _i16), np.zeros(size, _i16), np.zeros(size, _i16)
+    grey, moved, used = np.zeros(_LENGTH, _i16), np.zeros(_LENGTH, _i16), np.zeros(_LENGTH, _i16)
+    gx, gy = np.zeros(_LENGTH, _i16), np.zeros(_LENGTH, _i16)
     for k in range(WINDOW_PX * _STRIDE):
         used[k] = -1 if k % _STRIDE < WINDOW_PX else 0  # all bits
     for i in range(len(points)):
@@ -289,11 +297,14 @@ def _track_level(
         inverse = _ONE / determinant
         x, y = guess[i, 0] - half, guess[i, 1] - half
         last_x = last_y = np.float32(0.0)
+        copied = -2 * WINDOW_PX, 0  # no window begins there
         for k in range(iterations):
             u, v, weights = _cell(x, y)
             if _outside(u, v, target):
                 break
-            _copy(target, u, v, WINDOW_PX + 1, pixels)
+            if (u, v) != copied:
+                _copy(target, u, v, WINDOW_PX + 1, pixels)
+                copied = u, v
             _blend(pixels, weights, moved)
             bx = np.float32(_sum(moved, gx) - own_x) * _SCALE
             by = np.float32(_sum(moved, gy) - own_y) * _SCALE
@@ -341,7 +352,7 @@ def track_windows(
     iterations: int,
     step_px: float,
     least_eigenvalue: float,
-) -> tuple[_Pixels, BoolArray, _Errors]:
+) -> tuple[_Pixels, BoolArray, NDArray[np.float32]]:
     """Find points of one image in another, and those that were found in the first one again.
 
     The way back begins where it should end, so it needs no pyramid: what it tests is whether the
@@ -365,36 +376,25 @@ def track_windows(
         found: (N,) whether they were tracked, forward and backward.
         error_px: (N,) forward-backward error; infinite where a point was not found.
     """
-    n, scale = len(points), np.float32(1.0) / np.float32(1 << levels)
-    moved, found = np.empty((n, 2), np.float32), np.empty(n, np.bool_)
-    for i in range(n):
-        moved[i, 0], moved[i, 1] = start[i, 0] * scale, start[i, 1] * scale
-        found[i] = True
+    n, moved = len(points), start * (np.float32(1.0) / np.float32(1 << levels))
+    found, error_px = np.ones(n, np.bool_), np.full(n, np.inf, np.float32)
     for level in range(levels, -1, -1):
         one, other = _level(source, source_halvings, level), _level(target, target_halvings, level)
         _track_level(one, other, points, moved, found, level, iterations, step_px, least_eigenvalue)
         for i in range(n if level > 0 else 0):
             moved[i, 0], moved[i, 1] = np.float32(2.0) * moved[i, 0], np.float32(2.0) * moved[i, 1]
     height, width = target.shape
-    rows, error_px, count = np.empty(n, np.int64), np.empty(n, np.float32), 0
     for i in range(n):
         u, v = moved[i, 0], moved[i, 1]
         found[i] &= u >= border_px and u <= width - 1 - border_px
         found[i] &= v >= border_px and v <= height - 1 - border_px
-        rows[count], error_px[i] = i, np.inf
-        count += found[i]
-    ends, back = np.empty((count, 2), np.float32), np.empty((count, 2), np.float32)
-    returned = np.empty(count, np.bool_)
-    for k in range(count):
-        i, returned[k] = rows[k], True
-        ends[k, 0], ends[k, 1] = moved[i, 0], moved[i, 1]
-        back[k, 0], back[k, 1] = points[i, 0], points[i, 1]
+    rows = found.nonzero()[0]
+    ends, back, returned = moved[rows], points[rows], np.ones(len(rows), np.bool_)
     # The level is 0 by now; for a literal 0 all would be compiled once more
     _track_level(target, source, ends, back, returned, level, iterations, step_px, least_eigenvalue)
-    for k in range(count):
-        i = rows[k]
-        found[i] = returned[k]
+    found[rows] = returned
+    for k in range(len(rows)):
+        du, dv = back[k, 0] - points[rows[k], 0], back[k, 1] - points[rows[k], 1]
         if returned[k]:
-            du, dv = back[k, 0] - points[i, 0], back[k, 1] - points[i, 1]
-            error_px[i] = np.sqrt(du * du + dv * dv)
+            error_px[rows[k]] = np.sqrt(du * du + dv * dv)
     return moved, found, error_px
