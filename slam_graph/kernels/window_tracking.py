@@ -78,8 +78,8 @@ def _rounded(weight: np.float32) -> np.int32:
 def _cell(x: np.float32, y: np.float32) -> tuple[int, int, _Weights]:
     """The pixel (u, v) at the upper left of a place, and the weights of the four around it."""
     u, v = int(x), int(y)
-    u -= np.float32(u) > x  # negative ones were rounded up
-    v -= np.float32(v) > y
+    u -= int(np.float32(u) > x)  # negative ones were rounded up
+    v -= int(np.float32(v) > y)
     a, b = x - np.float32(u), y - np.float32(v)
     ul, ur = _rounded((_ONE - a) * (_ONE - b) * _WHOLE), _rounded(a * (_ONE - b) * _WHOLE)
     ll = _rounded((_ONE - a) * b * _WHOLE)
