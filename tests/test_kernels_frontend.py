@@ -7,8 +7,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from slam_graph.kernels.corner_scores import smallest_eigenvalues, smallest_eigenvalues_numpy
-from slam_graph.kernels.corners import strongest_maxima, strongest_maxima_numpy
+from slam_graph.kernels.corners import smallest_eigenvalues, strongest_in_cells, strongest_maxima
+from slam_graph.kernels.corners_numpy import (
+    smallest_eigenvalues_numpy,
+    strongest_in_cells_numpy,
+    strongest_maxima_numpy,
+)
 from slam_graph.kernels.epipolar import (
     ray_depths,
     ray_depths_numpy,
@@ -250,6 +254,37 @@ def test_strongest_maxima_are_those_of_opencv(count: int, distance_px: float, le
         opencv = np.column_stack([np.reshape(corners, (-1, 2)), np.ravel(strengths)])
         np.testing.assert_array_equal(found, opencv[opencv[:, 2] >= smallest])
     assert len(strongest_maxima(scores, np.zeros_like(allowed), 9, 0.05, 0.0, 1.0)) == 0
+
+
+@pytest.mark.parametrize(("missing", "surplus"), [(0, 1), (7, 1), (30, 2), (500, 2)])
+def test_strongest_in_cells(missing: int, surplus: int) -> None:
+    """Cells at the edge and in the middle of the image, without room, and without gradients."""
+    rng = np.random.default_rng(8)
+    image = cv2.GaussianBlur(rng.integers(0, 256, (100, 130), np.uint8), (0, 0), 1.5)
+    image[:45, 60:] = 90
+    image, free = np.ascontiguousarray(image), np.full(image.shape, 255, np.uint8)
+    free[50:, :40] = 0
+    free[60:70, 60:90] = 0
+    cells = np.array(
+        [(0, 0, 40, 50), (0, 50, 40, 100), (80, 0, 130, 40), (40, 50, 85, 100), (85, 50, 130, 100)]
+    )
+    masks, wanted = (free, free.copy()), np.array([3, 5, 2, 8, 400])
+    found, expected = (
+        strongest(image, mask, cells, 4, wanted, missing, surplus, 0.05, 1e-4, 6.0, disk(6))
+        for strongest, mask in zip(
+            (strongest_in_cells, strongest_in_cells_numpy), masks, strict=True
+        )
+    )
+    for one, other in zip(found, expected, strict=True):
+        np.testing.assert_array_equal(one, other)
+    np.testing.assert_array_equal(*masks)
+    points, counts, quotas = found
+    assert len(points) == counts.sum()
+    assert len(counts) == {0: 0, 7: 4, 30: 5, 500: 5}[missing]
+    if missing > 0:
+        assert counts[1] == counts[2] == 0  # nothing is free there, or there is no corner
+        assert quotas.tolist() == [min(missing, 3), *quotas[1:]]
+        assert np.all(counts <= surplus * quotas)
 
 
 @pytest.mark.parametrize("iterations", [1, 2, 20])

@@ -17,9 +17,13 @@ import numpy as np
 from slam_graph.arrays import IntArray
 from slam_graph.errors import ConfigError
 from slam_graph.frontend.frontend_config import DETECTORS, FrontendConfig
-from slam_graph.frontend.keypoints import Image, Keypoints, Pixels
-from slam_graph.kernels.corner_scores import WINDOW_PX, smallest_eigenvalues
-from slam_graph.kernels.corners import strongest_maxima
+from slam_graph.frontend.keypoints import Image, Keypoints, Pixels, contiguous
+from slam_graph.kernels.corners import (
+    WINDOW_PX,
+    smallest_eigenvalues,
+    strongest_in_cells,
+    strongest_maxima,
+)
 
 _INSTALL = "pip install 'slam-graph[descriptors]'"
 
@@ -112,8 +116,29 @@ class _GradientCorners:
 
 
 @DETECTORS.register("shi_tomasi")
-def _shi_tomasi(config: FrontendConfig) -> Detector:
-    return _GradientCorners(config, harris=False)
+class ShiTomasiCorners(_GradientCorners):
+    """Corners by their smaller eigenvalue, in all cells of an image at once."""
+
+    def __init__(self, config: FrontendConfig) -> None:
+        super().__init__(config, harris=False)
+
+    def detect_in_cells(
+        self,
+        image: Image,
+        free: Image,
+        cells: IntArray,
+        margin_px: int,
+        wanted: IntArray,
+        missing: int,
+        surplus: int,
+        distance_px: float,
+        half_widths: IntArray,
+    ) -> tuple[Pixels, IntArray, IntArray]:
+        """The strongest corners of each cell, which are far apart; see `strongest_in_cells`."""
+        limits = _RELATIVE_SCORE, self._smallest, distance_px, half_widths
+        cells, wanted = np.ascontiguousarray(cells), np.ascontiguousarray(wanted)
+        numbers = margin_px, wanted, missing, surplus
+        return strongest_in_cells(contiguous(image), free, cells, *numbers, *limits)
 
 
 @DETECTORS.register("harris")

@@ -13,7 +13,7 @@ import numpy as np
 
 from slam_graph.arrays import BoolArray, IntArray
 from slam_graph.errors import ConfigError
-from slam_graph.frontend.detectors import refine
+from slam_graph.frontend.detectors import ShiTomasiCorners, refine
 from slam_graph.frontend.frontend_config import DETECTORS, FrontendConfig
 from slam_graph.frontend.keypoints import Image, Keypoints, Pixels, spread
 from slam_graph.image_files import ImageFile
@@ -123,6 +123,7 @@ class FeatureExtractor:
             for down in pairwise(ys.tolist())
             for across in pairwise(xs.tolist())
         ]
+        self._bounds = np.array([(c.left, c.top, c.right, c.bottom) for c in self._cells], np.int64)
         self._edges = xs, ys
         allowed = np.zeros((height, width), np.uint8)
         allowed[BORDER_PX : height - BORDER_PX, BORDER_PX : width - BORDER_PX] = 255
@@ -154,12 +155,35 @@ class FeatureExtractor:
             occupied: (N, 2) features that are there.
             surplus: factor on the number of points, for callers that will reject some.
         """
-        free = self._free(occupied)
-        found: list[Pixels] = []
-        quotas: list[int] = []
-        missing = self._missing(occupied)
+        cells, shares = self._wanted(occupied)
+        if isinstance(self._detector, ShiTomasiCorners):
+            pixels, counts, quotas = self._detector.detect_in_cells(
+                image,
+                self._free(occupied),
+                self._bounds.take(cells, axis=0),
+                _MARGIN_PX,
+                shares,
+                self._missing(occupied),
+                surplus,
+                self._distance_px,
+                self._half_widths,
+            )
+        else:
+            pixels, counts, quotas = self._one_by_one(image, occupied, cells, shares, surplus)
+        visited = cells[: len(counts)]
+        self._rest[visited[counts < quotas]] = _REST_FRAMES
+        if self._config.subpixel:
+            pixels = refine(image, pixels)
+        return _Extracted(pixels, np.arange(len(counts)).repeat(counts), quotas)
+
+    def _one_by_one(
+        self, image: Image, occupied: Pixels, cells: IntArray, shares: IntArray, surplus: int
+    ) -> tuple[Pixels, IntArray, IntArray]:
+        """`ShiTomasiCorners.detect_in_cells` for other detectors."""
+        free, missing = self._free(occupied), self._missing(occupied)
+        found, quotas = [np.zeros((0, 2), np.float32)], []
         whole: Keypoints | None = None
-        for i, share in self._wanted(occupied):
+        for i, share in zip(cells.tolist(), shares.tolist(), strict=True):
             quota = min(missing, share)
             cell = self._cells[i]
             if self._detector.local:
@@ -167,19 +191,13 @@ class FeatureExtractor:
             else:
                 whole = self._whole(image, free) if whole is None else whole
                 best = whole.pixels[_inside(whole.pixels, cell)]
-            pixels = best[self._claim(free, best, surplus * quota)]
-            if len(pixels) < quota:
-                self._rest[i] = _REST_FRAMES
-            found.append(pixels)
+            found.append(best[self._claim(free, best, surplus * quota)])
             quotas.append(quota)
-            missing -= min(quota, len(pixels))
+            missing -= min(quota, len(found[-1]))
             if missing <= 0:
                 break
-        pixels = np.concatenate([np.zeros((0, 2), np.float32), *found])
-        if self._config.subpixel:
-            pixels = refine(image, pixels)
-        group = np.repeat(np.arange(len(found)), [len(part) for part in found])
-        return _Extracted(pixels, group, np.array(quotas, np.int64))
+        counts = np.array([len(pixels) for pixels in found[1:]], np.int64)
+        return np.concatenate(found), counts, np.array(quotas, np.int64)
 
     def candidates(self, image: Image, count: int) -> Keypoints:
         """Detect keypoints all over the image, whatever features are there already.
@@ -206,7 +224,8 @@ class FeatureExtractor:
         free = self._free(occupied)
         chosen: list[int] = []
         missing = self._missing(occupied)
-        for i, share in self._wanted(occupied):
+        cells, shares = self._wanted(occupied)
+        for i, share in zip(cells.tolist(), shares.tolist(), strict=True):
             inside = np.flatnonzero(_inside(keypoints.pixels, self._cells[i]))
             inside = inside[np.argsort(-keypoints.scores[inside], kind="stable")]
             best = inside[self._claim(free, keypoints.pixels[inside], min(missing, share))]
@@ -216,12 +235,12 @@ class FeatureExtractor:
                 break
         return np.array(chosen, np.int64)
 
-    def _wanted(self, occupied: Pixels) -> list[tuple[int, int]]:
-        """The cells that need features, emptiest first, and how many each needs."""
+    def _wanted(self, occupied: Pixels) -> tuple[IntArray, IntArray]:
+        """The cells (C,) that need features, emptiest first, and how many (C,) each needs."""
         self._rest = np.maximum(self._rest - 1, 0)
         missing = self._missing(occupied)
         if missing <= 0:
-            return []
+            return np.zeros(0, np.int64), np.zeros(0, np.int64)
         counts, of_the_world = self._count(occupied), np.ones(len(self._cells), np.bool_)
         if len(self._apart):
             apart = self._count(self._apart)
@@ -233,8 +252,7 @@ class FeatureExtractor:
         wanting = (counts < share) & awake & of_the_world
         cells = wanting.nonzero()[0]
         emptiest_first = cells[counts[cells].argsort(kind="stable")]
-        shares = share - counts[emptiest_first]
-        return list(zip(emptiest_first.tolist(), shares.tolist(), strict=True))
+        return emptiest_first, share - counts[emptiest_first]
 
     def _missing(self, occupied: Pixels) -> int:
         """How many features are wanted beside those that are there (N, 2)."""
