@@ -51,92 +51,105 @@ def _reflected(place: int, length: int) -> int:
 
 
 @compiled()
-def _gradients(
-    above: _Image, here: _Image, below: _Image, smooth: _Line, rising: _Line, dx: _Line, dy: _Line
-) -> None:
-    """Sobel's derivatives of a row; `smooth` and `rising` are room for it and two more."""
+def _sobel(
+    above: _Image, here: _Image, below: _Image, left: int, middle: int, right: int
+) -> tuple[np.int16, np.int16]:
+    """Sobel's derivatives by the pixels of three columns in three rows."""
+    k, m, n = _at(left), _at(middle), _at(right)
+    a, b, c, d = np.int16(above[k]), np.int16(above[n]), np.int16(below[k]), np.int16(below[n])
+    first = np.int16(np.int16(a + c) + np.int16(_TWO * np.int16(here[k])))
+    last = np.int16(np.int16(b + d) + np.int16(_TWO * np.int16(here[n])))
+    outer = np.int16(np.int16(c - a) + np.int16(d - b))
+    inner = np.int16(np.int16(below[m]) - np.int16(above[m]))
+    return np.int16(last - first), np.int16(outer + np.int16(_TWO * inner))
+
+
+@compiled()
+def _gradients(above: _Image, here: _Image, below: _Image, dx: _Line, dy: _Line) -> None:
+    """Sobel's derivatives of a row, without intermediate ones that would be read at once."""
     width = len(here)
-    for u in range(width):
-        a, b, c = np.int16(above[_at(u)]), np.int16(here[_at(u)]), np.int16(below[_at(u)])
-        smooth[_at(u + 1)] = np.int16(np.int16(a + c) + np.int16(_TWO * b))
-        rising[_at(u + 1)] = np.int16(c - a)
-    smooth[0], rising[0] = smooth[2], rising[2]
-    smooth[width + 1], rising[width + 1] = smooth[width - 1], rising[width - 1]
-    for u in range(width):
-        m, n = _at(u + 1), _at(u + 2)
-        dx[_at(u)] = np.int16(smooth[n] - smooth[_at(u)])
-        outer = np.int16(rising[_at(u)] + rising[n])
-        dy[_at(u)] = np.int16(outer + np.int16(_TWO * rising[m]))
+    for u in range(width - 2):
+        dx[_at(u + 1)], dy[_at(u + 1)] = _sobel(above, here, below, u, u + 1, u + 2)
+    for u in (0, width - 1):
+        columns = _reflected(u - 1, width), u, _reflected(u + 1, width)
+        dx[u], dy[u] = _sobel(above, here, below, *columns)
+
+
+# Sums over the columns of the window; few arrays in a loop, or it is not made of vectors
 
 
 @compiled()
-def _add(dx: _Line, dy: _Line, sign: np.int32, xx: _Sums, xy: _Sums, yy: _Sums) -> None:
-    """Add the products of a row's gradients to the sums over the columns, or take them away."""
-    for u in range(len(dx)):
-        x, y = np.int32(dx[_at(u)]), np.int32(dy[_at(u)])
-        signed_x, signed_y = np.int32(sign * x), np.int32(sign * y)
-        xx[_at(u)] = np.int32(xx[_at(u)] + np.int32(signed_x * x))
-        xy[_at(u)] = np.int32(xy[_at(u)] + np.int32(signed_x * y))
-        yy[_at(u)] = np.int32(yy[_at(u)] + np.int32(signed_y * y))
+def _move_squares(old: _Line, new: _Line, sums: _Sums) -> None:
+    """Take the squares of a row's gradients from sums, and add those of another: n² - o²."""
+    for u in range(len(sums)):
+        n, o = new[_at(u)], old[_at(u)]
+        change = np.int32(np.int32(np.int16(n - o)) * np.int32(np.int16(n + o)))
+        sums[_at(u)] = np.int32(sums[_at(u)] + change)
 
 
 @compiled()
-def _widen(columns: _Sums, padded: _Sums, sums: _Sums) -> None:
-    """Sums over the window's width along a row, which is reflected at its ends."""
-    width = len(columns)
-    for u in range(width):
-        padded[_at(u + _RADIUS)] = columns[_at(u)]
+def _move_products(old_x: _Line, old_y: _Line, new_x: _Line, new_y: _Line, sums: _Sums) -> None:
+    """The same with the products of both gradients."""
+    for u in range(len(sums)):
+        new = np.int32(np.int32(new_x[_at(u)]) * np.int32(new_y[_at(u)]))
+        old = np.int32(np.int32(old_x[_at(u)]) * np.int32(old_y[_at(u)]))
+        sums[_at(u)] = np.int32(sums[_at(u)] + np.int32(new - old))
+
+
+@compiled()
+def _reflect(sums: _Sums) -> None:
+    """Continue a row of sums beyond its ends, where `sums` has room for it."""
+    width = len(sums) - 2 * _RADIUS
     for k in range(_RADIUS):
-        padded[k] = columns[_reflected(k - _RADIUS, width)]
-        padded[width + _RADIUS + k] = columns[_reflected(width + k, width)]
-    for u in range(width):
-        total = np.int32(0)
-        for k in range(WINDOW_PX):
-            total = np.int32(total + padded[_at(u + k)])
-        sums[_at(u)] = total
+        sums[k] = sums[_RADIUS + _reflected(k - _RADIUS, width)]
+        sums[width + _RADIUS + k] = sums[_RADIUS + _reflected(width + k, width)]
 
 
 @compiled()
-def _eigenvalues(xx: _Sums, xy: _Sums, yy: _Sums, scale: np.float32, scores: _Scores) -> None:
-    """The smaller eigenvalue of each matrix ((xx, xy), (xy, yy)), times `scale`."""
+def _eigenvalues(xx: _Sums, xy: _Sums, yy: _Sums, scale: np.float32, scores: _Row) -> None:
+    """The smaller eigenvalues of a row, times `scale`, by sums over columns that are continued."""
     for u in range(len(scores)):
-        a, c = np.float32(xx[_at(u)]) * scale * _HALF, np.float32(yy[_at(u)]) * scale * _HALF
-        b = np.float32(xy[_at(u)]) * scale
+        sum_xx = sum_xy = sum_yy = np.int32(0)
+        for k in range(WINDOW_PX):
+            n = _at(u + k)
+            sum_xx = np.int32(sum_xx + xx[n])
+            sum_xy, sum_yy = np.int32(sum_xy + xy[n]), np.int32(sum_yy + yy[n])
+        a, c = np.float32(sum_xx) * scale * _HALF, np.float32(sum_yy) * scale * _HALF
+        b = np.float32(sum_xy) * scale
         scores[_at(u)] = (a + c) - np.sqrt((a - c) * (a - c) + b * b)
 
 
 @compiled()
-def _scores(
-    image: _Image, first_row: int, first_column: int, height: int, width: int, margin: int
-) -> _Scores:
-    """The scores (height, width) of a part of an image, without those of rows in the margin."""
+def _scores(image: _Image, left: int, top: int, width: int, height: int) -> _Scores:
+    """The scores (height, width) of a part of an image, which is reflected at its edges."""
     dx, dy = np.empty((height, width), np.int16), np.empty((height, width), np.int16)
-    smooth, rising = np.empty(width + 2, np.int16), np.empty(width + 2, np.int16)
-    first, last = first_column, first_column + width
+    right = left + width
     for v in range(height):
-        above = image[first_row + _reflected(v - 1, height)][first:last]
-        below = image[first_row + _reflected(v + 1, height)][first:last]
-        here = image[first_row + v][first:last]
-        _gradients(above, here, below, smooth, rising, dx[v], dy[v])
-    xx, xy, yy = np.zeros(width, np.int32), np.zeros(width, np.int32), np.zeros(width, np.int32)
-    sum_xx, sum_xy = np.empty(width, np.int32), np.empty(width, np.int32)
-    sum_yy, padded = np.empty(width, np.int32), np.empty(width + 2 * _RADIUS, np.int32)
+        above = image[top + _reflected(v - 1, height)][left:right]
+        below = image[top + _reflected(v + 1, height)][left:right]
+        _gradients(above, image[top + v][left:right], below, dx[v], dy[v])
+    length = width + 2 * _RADIUS
+    xx, xy, yy = np.zeros(length, np.int32), np.zeros(length, np.int32), np.zeros(length, np.int32)
+    own_xx, own_xy = xx[_RADIUS : _RADIUS + width], xy[_RADIUS : _RADIUS + width]
+    own_yy = yy[_RADIUS : _RADIUS + width]
     unit = 1.0 / (_LARGEST * WINDOW_PX)
     scale = np.float32(unit * unit)
     scores = np.empty((height, width), np.float32)
-    one, less = np.int32(1), np.int32(-1)
+    nothing = np.zeros(width, np.int16)
     for k in range(-_RADIUS, _RADIUS + 1):
         row = _reflected(k, height)
-        _add(dx[row], dy[row], one, xx, xy, yy)
+        _move_squares(nothing, dx[row], own_xx)
+        _move_squares(nothing, dy[row], own_yy)
+        _move_products(nothing, nothing, dx[row], dy[row], own_xy)
     for v in range(height):
-        if margin <= v < height - margin:
-            _widen(xx, padded, sum_xx)
-            _widen(xy, padded, sum_xy)
-            _widen(yy, padded, sum_yy)
-            _eigenvalues(sum_xx, sum_xy, sum_yy, scale, scores[v])
+        _reflect(xx)
+        _reflect(xy)
+        _reflect(yy)
+        _eigenvalues(xx, xy, yy, scale, scores[v])
         old, new = _reflected(v - _RADIUS, height), _reflected(v + _RADIUS + 1, height)
-        _add(dx[old], dy[old], less, xx, xy, yy)
-        _add(dx[new], dy[new], one, xx, xy, yy)
+        _move_squares(dx[old], dx[new], own_xx)
+        _move_squares(dy[old], dy[new], own_yy)
+        _move_products(dx[old], dy[old], dx[new], dy[new], own_xy)
     return scores
 
 
@@ -151,18 +164,20 @@ def smallest_eigenvalues(image: _Image) -> _Scores:
         (height, width), in the unit of `cv2.cornerMinEigenVal`.
     """
     height, width = image.shape
-    return _scores(image, 0, 0, height, width, 0)
+    return _scores(image, 0, 0, width, height)
 
 
 # Rows, in loops without branches, which are made of vectors
 
 
 @compiled()
-def _raise_to(highest: _Row, scores: _Row, allowed: _Flags) -> None:
-    """The larger ones of what was highest and the scores that are allowed."""
-    for u in range(len(highest)):
-        s, other = scores[_at(u)], highest[_at(u)]
-        highest[_at(u)] = s if (s > other) & (allowed[_at(u)] != _NO) else other
+def _largest(scores: NDArray[np.int32], allowed: _Flags) -> np.int32:
+    """The largest number that is allowed, at least 0."""
+    largest = np.int32(0)
+    for u in range(len(scores)):
+        s = scores[_at(u)] if allowed[_at(u)] != _NO else np.int32(0)
+        largest = s if s > largest else largest
+    return largest
 
 
 @compiled()
@@ -212,12 +227,11 @@ def strongest_maxima(
     height, width = scores.shape
     highest, is_maximum = np.zeros(width, np.float32), np.zeros(-(-width // 8) * 8, np.uint8)
     eights = is_maximum.view(np.uint64)
+    # Numbers above 0 are in the order of their bits, of which the largest is found by vectors
+    bits, largest = scores.view(np.int32), np.zeros(1, np.int32)
     for v in range(height):
-        _raise_to(highest, scores[v], allowed[v])
-    largest = np.float32(0.0)
-    for u in range(width):
-        largest = highest[u] if highest[u] > largest else largest
-    limit = np.float32(float(largest) * share)
+        largest[0] = max(largest[0], _largest(bits[v], allowed[v]))
+    limit = np.float32(float(largest.view(np.float32)[0]) * share)
     found = np.empty((height * width, 3), np.float32)
     n = 0
     for v in range(1, height - 1):
@@ -285,7 +299,7 @@ def _in_cell(
             some |= own[_at(u)]
     if some == _NO:
         return np.empty((0, 2), np.float32)
-    scores = _scores(image, first_v, first_u, height, width, 0)
+    scores = _scores(image, first_u, first_v, width, height)
     found = strongest_maxima(scores, allowed, count, share, smallest, distance_px)
     points = np.empty((len(found), 2), np.float32)
     for n in range(len(found)):
