@@ -85,8 +85,9 @@ def _sum_window(
             m += _at(1)
             g10[k], g11[k] = image[m, n], image[m, n + _at(1)]
         for k in range(ROW_PX):
-            upper = g00[k] + right[k] * (g01[k] - g00[k])
-            lower = g10[k] + right[k] * (g11[k] - g10[k])
+            # without np.int32 the differences have 64 bits, which have no vectors of conversions
+            upper = g00[k] + right[k] * np.int32(g01[k] - g00[k])
+            lower = g10[k] + right[k] * np.int32(g11[k] - g10[k])
             grey[k] = upper + below[k] * (lower - upper)
         grey[PATCH_PX] = 0.0
         begin, down = _at(row * ROW_PX), (row - _HALF) / _HALF
