@@ -135,10 +135,14 @@ class ShiTomasiCorners(_GradientCorners):
         half_widths: IntArray,
     ) -> tuple[Pixels, IntArray, IntArray]:
         """The strongest corners of each cell, which are far apart; see `strongest_in_cells`."""
+        points = np.empty((surplus * int(wanted.sum()), 2), np.float32)
+        counts, quotas = np.empty(len(cells), np.int64), np.empty(len(cells), np.int64)
+        places = contiguous(image), free, np.ascontiguousarray(cells), margin_px
+        numbers = np.ascontiguousarray(wanted), missing, surplus
         limits = _RELATIVE_SCORE, self._smallest, distance_px, half_widths
-        cells, wanted = np.ascontiguousarray(cells), np.ascontiguousarray(wanted)
-        numbers = margin_px, wanted, missing, surplus
-        return strongest_in_cells(contiguous(image), free, cells, *numbers, *limits)
+        seen = strongest_in_cells(*places, *numbers, *limits, points, counts, quotas)
+        counts = counts[:seen]
+        return points[: counts.sum()], counts, quotas[:seen]
 
 
 @DETECTORS.register("harris")

@@ -264,15 +264,14 @@ def strongest_maxima(
 
 
 @compiled()
-def _clear_disks(mask: _Mask, points: _Pixels, half_widths: IntArray) -> None:
-    """As `spacing.clear_disks`, which is not in this file, around whole pixels."""
+def _clear_disk(mask: _Mask, u: int, v: int, half_widths: IntArray) -> None:
+    """As `spacing.clear_disks`, which is not in this file, around one pixel."""
     height, width = mask.shape
     radius = len(half_widths) // 2
-    for n in range(len(points)):
-        u, v = int(points[n, 0]), int(points[n, 1])
-        for row in range(max(0, v - radius), min(height, v + radius + 1)):
-            half = half_widths[row - v + radius]
-            mask[row][max(0, u - half) : min(width, u + half + 1)] = _NO
+    for row in range(max(0, v - radius), min(height, v + radius + 1)):
+        half = half_widths[row - v + radius]
+        for column in range(max(0, u - half), min(width, u + half + 1)):
+            mask[row, column] = _NO
 
 
 @compiled()
@@ -285,8 +284,10 @@ def _in_cell(
     share: float,
     smallest: float,
     distance_px: float,
-) -> _Pixels:
-    """The strongest corners (N, 2) of one cell, as `strongest_in_cells` finds them."""
+    points: _Pixels,
+    begin: int,
+) -> int:
+    """Write the strongest corners of one cell to rows of `points`, and say how many there are."""
     left, top, right, bottom = cell[0], cell[1], cell[2], cell[3]
     first_u, first_v = max(0, left - margin), max(0, top - margin)
     width = min(image.shape[1], right + margin) - first_u
@@ -298,18 +299,17 @@ def _in_cell(
             row[_at(u - first_u)] = own[_at(u)]
             some |= own[_at(u)]
     if some == _NO:
-        return np.empty((0, 2), np.float32)
+        return 0
     scores = _scores(image, first_u, first_v, width, height)
     found = strongest_maxima(scores, allowed, count, share, smallest, distance_px)
-    points = np.empty((len(found), 2), np.float32)
-    for n in range(len(found)):
-        points[n, 0], points[n, 1] = found[n, 0] + first_u, found[n, 1] + first_v
-    return points
+    for k in range(len(found)):
+        points[begin + k, 0], points[begin + k, 1] = found[k, 0] + first_u, found[k, 1] + first_v
+    return len(found)
 
 
 @compiled(
-    "Tuple((f4[:, ::1], i8[::1], i8[::1]))(u1[:, ::1], u1[:, ::1], i8[:, ::1], i8, i8[::1], i8, "
-    "i8, f8, f8, f8, i8[::1])"
+    "i8(u1[:, ::1], u1[:, ::1], i8[:, ::1], i8, i8[::1], i8, i8, f8, f8, f8, i8[::1], "
+    "f4[:, ::1], i8[::1], i8[::1])"
 )
 def strongest_in_cells(
     image: _Image,
@@ -323,7 +323,10 @@ def strongest_in_cells(
     smallest: float,
     distance_px: float,
     half_widths: IntArray,
-) -> tuple[_Pixels, IntArray, IntArray]:
+    points: _Pixels,
+    counts: IntArray,
+    quotas: IntArray,
+) -> int:
     """Corners in cells of an image, one cell after the other, until there are enough.
 
     Args:
@@ -338,23 +341,23 @@ def strongest_in_cells(
         smallest: score of a corner.
         distance_px: smallest distance between two corners of a cell.
         half_widths: of the disks, as in `spacing.clear_disks`.
+        points: filled with pixels, cell by cell, the best of a cell first; `surplus` times as many
+            as are wanted fit in.
+        counts: (C,) filled with how many there are in each cell.
+        quotas: (C,) filled with how many were wanted of it.
 
     Returns:
-        points: (N, 2) pixels, cell by cell, the best of a cell first.
-        counts: (V,) how many there are in each of the first V cells, beyond which all were found.
-        quotas: (V,) how many of them were wanted.
+        In how many cells they were looked for.
     """
-    points = np.empty((surplus * wanted.sum(), 2), np.float32)
-    counts, quotas = np.empty(len(cells), np.int64), np.empty(len(cells), np.int64)
     n = seen = 0
     while seen < len(cells) and missing > 0:
         quota = min(missing, wanted[seen])
         limits = surplus * quota, share, smallest, distance_px
-        found = _in_cell(image, free, cells[seen], margin, *limits)
-        _clear_disks(free, found, half_widths)
-        points[n : n + len(found)] = found
-        counts[seen], quotas[seen] = len(found), quota
-        missing -= min(quota, len(found))
-        n += len(found)
+        count = _in_cell(image, free, cells[seen], margin, *limits, points, n)
+        for k in range(n, n + count):
+            _clear_disk(free, int(points[k, 0]), int(points[k, 1]), half_widths)
+        counts[seen], quotas[seen] = count, quota
+        missing -= min(quota, count)
+        n += count
         seen += 1
-    return points[:n].copy(), counts[:seen].copy(), quotas[:seen].copy()
+    return seen

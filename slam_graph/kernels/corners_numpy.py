@@ -67,22 +67,26 @@ def strongest_in_cells_numpy(
     smallest: float,
     distance_px: float,
     half_widths: IntArray,
-) -> tuple[_Pixels, IntArray, IntArray]:
+    points: _Pixels,
+    counts: IntArray,
+    quotas: IntArray,
+) -> int:
     """`strongest_in_cells` in NumPy."""
-    found, quotas = [np.zeros((0, 2), np.float32)], []
-    for (left, top, right, bottom), most in zip(cells.tolist(), wanted.tolist(), strict=True):
+    n = 0
+    for seen, (left, top, right, bottom) in enumerate(cells.tolist()):
         if missing <= 0:
-            break
+            return seen
         u, v = max(0, left - margin), max(0, top - margin)
         part = image[v : bottom + margin, u : right + margin]
         allowed = np.zeros_like(part)
         own = slice(top - v, bottom - v), slice(left - u, right - u)
         allowed[own] = free[top:bottom, left:right]
-        quotas.append(min(missing, most))
-        limits = surplus * quotas[-1], share, smallest, distance_px
+        quotas[seen] = min(missing, wanted[seen])
+        limits = surplus * quotas[seen], share, smallest, distance_px
         best = strongest_maxima_numpy(smallest_eigenvalues_numpy(part), allowed, *limits)
-        found.append((best[:, :2] + (u, v)).astype(np.float32))
-        clear_disks_numpy(free, found[-1], half_widths)
-        missing -= min(quotas[-1], len(best))
-    counts = np.array([len(points) for points in found[1:]], np.int64)
-    return np.concatenate(found), counts, np.array(quotas, np.int64)
+        counts[seen] = len(best)
+        points[n : n + len(best)] = best[:, :2] + (u, v)
+        clear_disks_numpy(free, points[n : n + len(best)], half_widths)
+        missing -= min(quotas[seen], len(best))
+        n += len(best)
+    return len(cells)
