@@ -286,13 +286,14 @@ def test_strongest_in_cells(missing: int, surplus: int) -> None:
     masks, wanted = (free, free.copy()), np.array([3, 5, 2, 8, 400])
     results = []
     for strongest, mask in zip((strongest_in_cells, strongest_in_cells_numpy), masks, strict=True):
-        room = np.zeros((surplus * wanted.sum(), 2), np.float32), *np.zeros((2, 5), np.int64)
+        points = np.zeros((surplus * wanted.sum(), 2), np.float32)
+        room = np.zeros(60 * 60, np.float32), points, *np.zeros((2, 5), np.int64)
         limits = missing, surplus, 0.05, 1e-4, 6.0, disk(6)
         results.append((strongest(image, mask, cells, 4, wanted, *limits, *room), *room))
     for one, other in zip(*results, strict=True):
         np.testing.assert_array_equal(one, other)
     np.testing.assert_array_equal(*masks)
-    seen, points, counts, quotas = results[0]
+    seen, _, points, counts, quotas = results[0]
     assert np.count_nonzero(points.any(axis=1)) == counts.sum()
     assert seen == {0: 0, 7: 4, 30: 5, 500: 5}[missing]
     if missing > 0:

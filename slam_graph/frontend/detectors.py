@@ -121,6 +121,7 @@ class ShiTomasiCorners(_GradientCorners):
 
     def __init__(self, config: FrontendConfig) -> None:
         super().__init__(config, harris=False)
+        self._room = np.empty(0, np.float32)
 
     def detect_in_cells(
         self,
@@ -135,12 +136,17 @@ class ShiTomasiCorners(_GradientCorners):
         half_widths: IntArray,
     ) -> tuple[Pixels, IntArray, IntArray]:
         """The strongest corners of each cell, which are far apart; see `strongest_in_cells`."""
+        size = int(np.prod(cells[:, 2:] - cells[:, :2] + 2 * margin_px, axis=1).max(initial=0))
+        if size > len(self._room):
+            self._room = np.empty(size, np.float32)
         points = np.empty((surplus * int(wanted.sum()), 2), np.float32)
         counts, quotas = np.empty(len(cells), np.int64), np.empty(len(cells), np.int64)
         places = contiguous(image), free, np.ascontiguousarray(cells), margin_px
         numbers = np.ascontiguousarray(wanted), missing, surplus
-        limits = _RELATIVE_SCORE, self._smallest, distance_px, half_widths
-        seen = strongest_in_cells(*places, *numbers, *limits, points, counts, quotas)
+        limits = _RELATIVE_SCORE, self._smallest, distance_px
+        seen = strongest_in_cells(
+            *places, *numbers, *limits, half_widths, self._room, points, counts, quotas
+        )
         counts = counts[:seen]
         return points[: counts.sum()], counts, quotas[:seen]
 

@@ -51,28 +51,21 @@ def _reflected(place: int, length: int) -> int:
 
 
 @compiled()
-def _sobel(
-    above: _Image, here: _Image, below: _Image, left: int, middle: int, right: int
-) -> tuple[np.int16, np.int16]:
-    """Sobel's derivatives by the pixels of three columns in three rows."""
-    k, m, n = _at(left), _at(middle), _at(right)
-    a, b, c, d = np.int16(above[k]), np.int16(above[n]), np.int16(below[k]), np.int16(below[n])
-    first = np.int16(np.int16(a + c) + np.int16(_TWO * np.int16(here[k])))
-    last = np.int16(np.int16(b + d) + np.int16(_TWO * np.int16(here[n])))
-    outer = np.int16(np.int16(c - a) + np.int16(d - b))
-    inner = np.int16(np.int16(below[m]) - np.int16(above[m]))
-    return np.int16(last - first), np.int16(outer + np.int16(_TWO * inner))
-
-
-@compiled()
 def _gradients(above: _Image, here: _Image, below: _Image, dx: _Line, dy: _Line) -> None:
     """Sobel's derivatives of a row, without intermediate ones that would be read at once."""
     width = len(here)
     for u in range(width - 2):
-        dx[_at(u + 1)], dy[_at(u + 1)] = _sobel(above, here, below, u, u + 1, u + 2)
-    for u in (0, width - 1):
-        columns = _reflected(u - 1, width), u, _reflected(u + 1, width)
-        dx[u], dy[u] = _sobel(above, here, below, *columns)
+        k, m, n = _at(u), _at(u + 1), _at(u + 2)
+        a, b, c, d = np.int16(above[k]), np.int16(above[n]), np.int16(below[k]), np.int16(below[n])
+        first = np.int16(np.int16(a + c) + np.int16(_TWO * np.int16(here[k])))
+        last = np.int16(np.int16(b + d) + np.int16(_TWO * np.int16(here[n])))
+        outer = np.int16(np.int16(c - a) + np.int16(d - b))
+        inner = np.int16(np.int16(below[m]) - np.int16(above[m]))
+        dx[m], dy[m] = np.int16(last - first), np.int16(outer + np.int16(_TWO * inner))
+    for u in range(0, width, max(width - 1, 1)):  # at the ends both neighbours are the same
+        other = min(1, width - 1) if u == 0 else u - 1
+        dx[u], outer = 0, np.int16(below[other]) - np.int16(above[other])
+        dy[u] = _TWO * (outer + np.int16(below[u]) - np.int16(above[u]))
 
 
 # Sums over the columns of the window; few arrays in a loop, or it is not made of vectors
@@ -97,12 +90,13 @@ def _move_products(old_x: _Line, old_y: _Line, new_x: _Line, new_y: _Line, sums:
 
 
 @compiled()
-def _reflect(sums: _Sums) -> None:
-    """Continue a row of sums beyond its ends, where `sums` has room for it."""
-    width = len(sums) - 2 * _RADIUS
-    for k in range(_RADIUS):
-        sums[k] = sums[_RADIUS + _reflected(k - _RADIUS, width)]
-        sums[width + _RADIUS + k] = sums[_RADIUS + _reflected(width + k, width)]
+def _reflect(xx: _Sums, xy: _Sums, yy: _Sums) -> None:
+    """Continue a row of sums beyond its ends, where there is room for it."""
+    width = len(xx) - 2 * _RADIUS
+    for k in range(2 * _RADIUS):
+        place = k - _RADIUS if k < _RADIUS else k - _RADIUS + width
+        here, there = place + _RADIUS, _reflected(place, width) + _RADIUS
+        xx[here], xy[here], yy[here] = xx[there], xy[there], yy[there]
 
 
 @compiled()
@@ -120,9 +114,11 @@ def _eigenvalues(xx: _Sums, xy: _Sums, yy: _Sums, scale: np.float32, scores: _Ro
 
 
 @compiled()
-def _scores(image: _Image, left: int, top: int, width: int, height: int) -> _Scores:
+def _fill_scores(image: _Image, left: int, top: int, scores: _Scores) -> None:
     """The scores (height, width) of a part of an image, which is reflected at its edges."""
-    dx, dy = np.empty((height, width), np.int16), np.empty((height, width), np.int16)
+    height, width = scores.shape
+    # one row more, which is zero
+    dx, dy = np.zeros((height + 1, width), np.int16), np.zeros((height + 1, width), np.int16)
     right = left + width
     for v in range(height):
         above = image[top + _reflected(v - 1, height)][left:right]
@@ -134,26 +130,18 @@ def _scores(image: _Image, left: int, top: int, width: int, height: int) -> _Sco
     own_yy = yy[_RADIUS : _RADIUS + width]
     unit = 1.0 / (_LARGEST * WINDOW_PX)
     scale = np.float32(unit * unit)
-    scores = np.empty((height, width), np.float32)
-    nothing = np.zeros(width, np.int16)
-    for k in range(-_RADIUS, _RADIUS + 1):
-        row = _reflected(k, height)
-        _move_squares(nothing, dx[row], own_xx)
-        _move_squares(nothing, dy[row], own_yy)
-        _move_products(nothing, nothing, dx[row], dy[row], own_xy)
-    for v in range(height):
-        _reflect(xx)
-        _reflect(xy)
-        _reflect(yy)
-        _eigenvalues(xx, xy, yy, scale, scores[v])
-        old, new = _reflected(v - _RADIUS, height), _reflected(v + _RADIUS + 1, height)
+    for row in range(-_RADIUS, height + _RADIUS):
+        first = row - WINDOW_PX + 1  # of the window whose last one this is
+        new = _reflected(row, height)
+        old = height if first <= -_RADIUS else _reflected(first - 1, height)
         _move_squares(dx[old], dx[new], own_xx)
         _move_squares(dy[old], dy[new], own_yy)
         _move_products(dx[old], dy[old], dx[new], dy[new], own_xy)
-    return scores
+        if first >= -_RADIUS:
+            _reflect(xx, xy, yy)
+            _eigenvalues(xx, xy, yy, scale, scores[first + _RADIUS])
 
 
-@compiled("f4[:, ::1](u1[:, ::1])")
 def smallest_eigenvalues(image: _Image) -> _Scores:
     """The smaller eigenvalue of the covariance of the gradient in a window around each pixel.
 
@@ -164,7 +152,13 @@ def smallest_eigenvalues(image: _Image) -> _Scores:
         (height, width), in the unit of `cv2.cornerMinEigenVal`.
     """
     height, width = image.shape
-    return _scores(image, 0, 0, width, height)
+    scores, nothing = np.empty(height * width, np.float32), np.zeros((0, 2), np.float32)
+    cell, one = np.array([[0, 0, width, height]], np.int64), np.ones(1, np.int64)
+    # no corners are asked for; a kernel of its own would be all the same code, compiled twice
+    places = image, np.ones_like(image), cell, 0, one, 1, 0
+    limits = 0.0, 0.0, 0.0, np.zeros(1, np.int64)
+    strongest_in_cells(*places, *limits, scores, nothing, one.copy(), one.copy())
+    return scores.reshape(height, width)
 
 
 # Rows, in loops without branches, which are made of vectors
@@ -225,8 +219,7 @@ def strongest_maxima(
         (N, 3) column, row and score, the best first.
     """
     height, width = scores.shape
-    highest, is_maximum = np.zeros(width, np.float32), np.zeros(-(-width // 8) * 8, np.uint8)
-    eights = is_maximum.view(np.uint64)
+    highest, is_maximum = np.zeros(width, np.float32), np.zeros(width, np.uint8)
     # Numbers above 0 are in the order of their bits, of which the largest is found by vectors
     bits, largest = scores.view(np.int32), np.zeros(1, np.int32)
     for v in range(height):
@@ -237,30 +230,28 @@ def strongest_maxima(
     for v in range(1, height - 1):
         _column_maxima(scores[v - 1], scores[v], scores[v + 1], highest)
         _row_maxima(scores[v], highest, allowed[v], limit, is_maximum)
-        for k in range(len(eights)):
-            if eights[k] == 0:
-                continue
-            for u in range(8 * k, 8 * k + 8):
-                if is_maximum[u] != _NO:
-                    found[n, 0], found[n, 1], found[n, 2] = u, v, scores[v, u]
-                    n += 1
-    chosen = np.empty((count, 3), np.float32)
+        for u in range(1, width - 1):
+            if is_maximum[u] != _NO:
+                found[n, 0], found[n, 1], found[n, 2] = u, v, scores[v, u]
+                n += 1
+    chosen, taken = np.empty((count, 3), np.float32), 0
     near = np.float32(min(distance_px * distance_px, 1e12))
-    for taken in range(count):
+    while taken < count:
         best, most = -1, np.float32(0.0)
         for k in range(n):
             if found[k, 2] > 0.0 and found[k, 2] >= most:
                 best, most = k, found[k, 2]
         if best < 0 or float(most) < smallest:
-            return chosen[:taken].copy()
+            break
         column, row = found[best, 0], found[best, 1]
         chosen[taken, 0], chosen[taken, 1], chosen[taken, 2] = column, row, most
         found[best, 2] = 0.0
+        taken += 1
         for k in range(n):  # those too near to it are no more
             x, y = found[k, 0] - column, found[k, 1] - row
             if x * x + y * y < near:
                 found[k, 2] = 0.0
-    return chosen
+    return chosen[:taken]
 
 
 @compiled()
@@ -284,6 +275,7 @@ def _in_cell(
     share: float,
     smallest: float,
     distance_px: float,
+    room: _Row,
     points: _Pixels,
     begin: int,
 ) -> int:
@@ -300,7 +292,8 @@ def _in_cell(
             some |= own[_at(u)]
     if some == _NO:
         return 0
-    scores = _scores(image, first_u, first_v, width, height)
+    scores = room[: height * width].reshape((height, width))
+    _fill_scores(image, first_u, first_v, scores)
     found = strongest_maxima(scores, allowed, count, share, smallest, distance_px)
     for k in range(len(found)):
         points[begin + k, 0], points[begin + k, 1] = found[k, 0] + first_u, found[k, 1] + first_v
@@ -309,7 +302,7 @@ def _in_cell(
 
 @compiled(
     "i8(u1[:, ::1], u1[:, ::1], i8[:, ::1], i8, i8[::1], i8, i8, f8, f8, f8, i8[::1], "
-    "f4[:, ::1], i8[::1], i8[::1])"
+    "f4[::1], f4[:, ::1], i8[::1], i8[::1])"
 )
 def strongest_in_cells(
     image: _Image,
@@ -323,6 +316,7 @@ def strongest_in_cells(
     smallest: float,
     distance_px: float,
     half_widths: IntArray,
+    room: _Row,
     points: _Pixels,
     counts: IntArray,
     quotas: IntArray,
@@ -341,6 +335,7 @@ def strongest_in_cells(
         smallest: score of a corner.
         distance_px: smallest distance between two corners of a cell.
         half_widths: of the disks, as in `spacing.clear_disks`.
+        room: as large as the largest cell and its margin; filled with scores by rows.
         points: filled with pixels, cell by cell, the best of a cell first; `surplus` times as many
             as are wanted fit in.
         counts: (C,) filled with how many there are in each cell.
@@ -353,7 +348,7 @@ def strongest_in_cells(
     while seen < len(cells) and missing > 0:
         quota = min(missing, wanted[seen])
         limits = surplus * quota, share, smallest, distance_px
-        count = _in_cell(image, free, cells[seen], margin, *limits, points, n)
+        count = _in_cell(image, free, cells[seen], margin, *limits, room, points, n)
         for k in range(n, n + count):
             _clear_disk(free, int(points[k, 0]), int(points[k, 1]), half_widths)
         counts[seen], quotas[seen] = count, quota

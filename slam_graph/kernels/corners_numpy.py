@@ -67,6 +67,7 @@ def strongest_in_cells_numpy(
     smallest: float,
     distance_px: float,
     half_widths: IntArray,
+    room: _Scores,
     points: _Pixels,
     counts: IntArray,
     quotas: IntArray,
@@ -83,7 +84,10 @@ def strongest_in_cells_numpy(
         allowed[own] = free[top:bottom, left:right]
         quotas[seen] = min(missing, wanted[seen])
         limits = surplus * quotas[seen], share, smallest, distance_px
-        best = strongest_maxima_numpy(smallest_eigenvalues_numpy(part), allowed, *limits)
+        scores = smallest_eigenvalues_numpy(part)
+        if allowed.any():
+            room[: scores.size] = scores.ravel()
+        best = strongest_maxima_numpy(scores, allowed, *limits)
         counts[seen] = len(best)
         points[n : n + len(best)] = best[:, :2] + (u, v)
         clear_disks_numpy(free, points[n : n + len(best)], half_widths)

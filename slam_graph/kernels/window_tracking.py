@@ -32,7 +32,6 @@ WINDOW_PX = 17
 _STRIDE = WINDOW_PX + 3
 _WEIGHT_BITS, _IMAGE_BITS = 14, 14 - 5
 """Bits of weights, and those rounded off: grey values in a window keep five after the point."""
-
 _LOW_BITS, _HALF_BITS = 6, 11
 """Bits of the lower part of a weight, and of that of a sum of products."""
 
@@ -41,14 +40,11 @@ _WITHOUT_FRACTION = np.float32(1 << 23)
 """Added and taken away again it rounds as `rint`, without the cost of a call."""
 _SCALE = np.float32(1.0 / (1 << 20))
 """Of sums of products, so that the smallest eigenvalue is in OpenCV's unit."""
-
 _SINGULAR = np.float32(np.finfo(np.float32).eps)
 _OSCILLATION_PX = 0.01
 """Two steps that cancel to within this end the iteration, half way between their ends."""
-
 _MIDDLE = 255 << 4
 """Grey value, with five bits after the point, from which those of windows count."""
-
 _BLOCK, _LENGTH, _AROUND = 88, 4 * 88, 384
 """So many products are added in 32 bits (88 * 4081 * 4081, of derivatives, is below 2^31). Length
 of a window, made up to whole blocks, and with the pixels around it: whole vectors of 16 numbers."""
@@ -254,7 +250,7 @@ def _track_level(
         target: the same level of the other.
         points: (N, 2) pixels of level 0 in `source`.
         guess: (N, 2) where to start, in pixels of this level of `target`; then what was found.
-        good: (N,) made false, on level 0, where a window is outside or has too little gradient.
+        good: (N,) which to find; on level 0 made false where one is outside or has no gradient.
         level: of the pyramid; 0 is the image itself.
         iterations: most steps.
         step_px: a step that is not longer than this is the last one.
@@ -269,10 +265,12 @@ def _track_level(
     for k in range(WINDOW_PX * _STRIDE):
         used[k] = -1 if k % _STRIDE < WINDOW_PX else 0  # all bits
     for i in range(len(points)):
+        if not good[i]:
+            continue
         x, y = points[i, 0] * scale - half, points[i, 1] * scale - half
         u, v, weights = _cell(x, y)
         if _outside(u, v, source):
-            good[i] &= level > 0
+            good[i] = level > 0
             continue
         _copy(source, u - 1, v - 1, WINDOW_PX + 3, pixels)
         _blend_in_halves(pixels, weights, dx, dy)
@@ -292,7 +290,7 @@ def _track_level(
         root = np.sqrt((xx - yy) * (xx - yy) + np.float32(4.0) * xy * xy)
         eigenvalue = (yy + xx - root) / np.float32(2 * WINDOW_PX * WINDOW_PX)
         if eigenvalue < least_eigenvalue or determinant < _SINGULAR:
-            good[i] &= level > 0
+            good[i] = level > 0
             continue
         inverse = _ONE / determinant
         x, y = guess[i, 0] - half, guess[i, 1] - half
@@ -321,7 +319,7 @@ def _track_level(
             last_x, last_y = step_x, step_y
         u, v, weights = _cell(guess[i, 0] - half, guess[i, 1] - half)
         if _outside(u, v, target):
-            good[i] &= level > 0
+            good[i] = level > 0
 
 
 @compiled()
@@ -376,8 +374,12 @@ def track_windows(
         found: (N,) whether they were tracked, forward and backward.
         error_px: (N,) forward-backward error; infinite where a point was not found.
     """
-    n, moved = len(points), start * (np.float32(1.0) / np.float32(1 << levels))
-    found, error_px = np.ones(n, np.bool_), np.full(n, np.inf, np.float32)
+    n, scale = len(points), np.float32(1.0) / np.float32(1 << levels)
+    moved, found = np.empty((n, 2), np.float32), np.empty(n, np.bool_)
+    back, error_px = np.empty((n, 2), np.float32), np.empty(n, np.float32)
+    for i in range(n):
+        moved[i, 0], moved[i, 1] = start[i, 0] * scale, start[i, 1] * scale
+        found[i], error_px[i] = True, np.inf
     for level in range(levels, -1, -1):
         one, other = _level(source, source_halvings, level), _level(target, target_halvings, level)
         _track_level(one, other, points, moved, found, level, iterations, step_px, least_eigenvalue)
@@ -388,13 +390,11 @@ def track_windows(
         u, v = moved[i, 0], moved[i, 1]
         found[i] &= u >= border_px and u <= width - 1 - border_px
         found[i] &= v >= border_px and v <= height - 1 - border_px
-    rows = found.nonzero()[0]
-    ends, back, returned = moved[rows], points[rows], np.ones(len(rows), np.bool_)
+        back[i, 0], back[i, 1] = points[i, 0], points[i, 1]
     # The level is 0 by now; for a literal 0 all would be compiled once more
-    _track_level(target, source, ends, back, returned, level, iterations, step_px, least_eigenvalue)
-    found[rows] = returned
-    for k in range(len(rows)):
-        du, dv = back[k, 0] - points[rows[k], 0], back[k, 1] - points[rows[k], 1]
-        if returned[k]:
-            error_px[rows[k]] = np.sqrt(du * du + dv * dv)
+    _track_level(target, source, moved, back, found, level, iterations, step_px, least_eigenvalue)
+    for i in range(n):
+        if found[i]:
+            du, dv = back[i, 0] - points[i, 0], back[i, 1] - points[i, 1]
+            error_px[i] = np.sqrt(du * du + dv * dv)
     return moved, found, error_px
