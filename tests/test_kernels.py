@@ -46,6 +46,7 @@ from slam_graph.kernels.patch_search import most_similar, most_similar_numpy
 from slam_graph.kernels.projection import (
     chain_rule,
     chain_rule_numpy,
+    distort_equidistant,
     distort_radtan,
     to_cameras,
     to_cameras_numpy,
@@ -109,6 +110,22 @@ def test_brown_distortion() -> None:
     for rows, lens, model in (camera == 0, lenses[0], "radtan"), (camera == 1, lenses[1], "none"):
         coefficients = tuple(lens[4:]) if model == "radtan" else ()
         expected = Camera(*lens[:4], model, coefficients, 752, 480).distort(m[rows])
+        assert same(pixels[rows], expected[0])
+        assert same(slopes[rows], expected[1])
+
+
+def test_distort_equidistant() -> None:
+    """Up to 84° off the axis, and on it, where its scale is a limit."""
+    rng = np.random.default_rng(3)
+    m = np.concatenate([rng.uniform(-7.0, 7.0, (40, 2)), [[0, 0], [1e-10, 0], [5e-8, 1e-8]]])
+    camera = rng.integers(0, 2, len(m))
+    lenses = np.array([[190, 191, 254, 256, 3e-3, 7e-4, -2e-3, 2e-4], [1, 2, 3, 4, 0, 0, 0, 0]])
+    pixels, slopes = np.empty((len(m), 2)), np.empty((len(m), 2, 2))
+    distort_equidistant(m, camera, lenses, pixels, slopes)
+    for number, lens in enumerate(lenses):
+        rows = camera == number
+        model = Camera(*lens[:4], "equidistant", tuple(lens[4:]), 512, 512)
+        expected = model.distort(m[rows])
         assert same(pixels[rows], expected[0])
         assert same(slopes[rows], expected[1])
 

@@ -81,22 +81,25 @@ _BEST_FEATURES = 0.1
 class BatchCost(Cost):
     """The cost of a window whose features outside the state follow the poses."""
 
+    _moved: FloatArray | None = None  # squared residuals (N,) where a step has led
+
     def apply(self, delta: FloatArray, linear: Linearization, layout: Layout) -> None:
         """Move the states by an increment (n,), and triangulate the features from there."""
         super().apply(delta, linear, layout)
         assert self.tracks is not None
-        tracks = self.tracks
-        found = self.triangulated(tracks.obs)
-        better = found.good & (self._errors(found.points) < self._errors(tracks.points))
+        tracks, obs = self.tracks, self.tracks.obs
+        found = self.triangulated(obs)
+        squares = [self.squared_errors(obs, points) for points in (found.points, tracks.points)]
+        ours, theirs = (np.bincount(obs.feature, part, len(obs.ids)) for part in squares)
+        better = found.good & (ours < theirs)
         points = np.where(better[:, None], found.points, tracks.points)
         self.tracks = replace(tracks, points=points)
+        self._moved = np.where(better[obs.feature], *squares)
 
-    def _errors(self, points: FloatArray) -> FloatArray:
-        """Summed squared residuals (J,) of the features at some positions (J, 3), in σ²."""
-        assert self.tracks is not None
-        obs = self.tracks.obs
-        squares = self.squared_errors(obs, points)
-        return np.asarray(np.bincount(obs.feature, squares, len(obs.ids)))
+    def _squares(self, obs: Observations, points: FloatArray | None) -> FloatArray:
+        """Squared residuals (N,): after a step those by which it has chosen its features."""
+        known, self._moved = self._moved, None
+        return self.squared_errors(obs, points) if known is None else known
 
     def triangulated(self, obs: Observations) -> Triangulation:
         """Features from the current estimates of the poses."""
@@ -132,7 +135,8 @@ class DynamicRefinement:
             frames: what they observed.
             guess: their states, and which features are static.
         """
-        cost = self._batch_cost(frames, guess)
+        lasting = _lasting(frames)
+        cost = self._batch_cost(frames, guess, lasting)
         try:
             linear = cost.linearize(summed=True)
             hopeless = self._hopeless(cost, linear, len(guess.static))
@@ -140,7 +144,7 @@ class DynamicRefinement:
                 return hopeless
             minimize(cost, _BATCH, linear)
             self._refine_motions(cost, frames)
-            fit, seen = self._remove_outliers(cost, frames)
+            fit, seen = self._remove_outliers(cost, lasting)
             if fit < max(MIN_FEATURES, _MIN_INLIERS * seen):
                 return Refusal("fit", f"features that fit the motion ({fit} of {seen} do)")
             minimize(cost, _BATCH)
@@ -225,7 +229,7 @@ class DynamicRefinement:
             return Refusal("motion", needs)
         return None
 
-    def _batch_cost(self, frames: StartFrames, guess: StartGuess) -> BatchCost:
+    def _batch_cost(self, frames: StartFrames, guess: StartGuess, obs: Observations) -> BatchCost:
         """All states of the window, a prior on the first, and the static features they see."""
         context = self._context
         state = State()
@@ -237,7 +241,6 @@ class DynamicRefinement:
             context.calibration.note_motion(state, k, stamp_ns, frame.stamp_ns, context.imu)
         loss = RobustLoss(context.config.gating.loss)
         cost = BatchCost(state, context.projection, context.config, known, factors, loss=loss)
-        obs = _lasting(frames)
         result = cost.triangulated(obs)
         _set_features(cost, obs, result, result.good & is_in(obs.ids, guess.static))
         return cost
@@ -263,13 +266,12 @@ class DynamicRefinement:
         for k, stamp_ns in enumerate(frames.stamps_ns):
             self._context.calibration.refine_motion(cost.state, k, stamp_ns, self._context.imu)
 
-    def _remove_outliers(self, cost: BatchCost, frames: StartFrames) -> tuple[int, int]:
+    def _remove_outliers(self, cost: BatchCost, obs: Observations) -> tuple[int, int]:
         """Triangulate all features again and keep those that fit; their number, and that of all.
 
         Features that the guess took for dynamic count too: a motion that only few features support
         is wrong.
         """
-        obs = _lasting(frames)
         result = cost.triangulated(obs)
         fits = result.reprojection_px < OUTLIER_SIGMAS * self._context.config.noise.pixel_sigma
         good = result.good & fits

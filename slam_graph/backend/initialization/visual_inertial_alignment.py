@@ -30,7 +30,7 @@ _REWEIGHTINGS = 2
 MIN_DEPTH_M = 0.1
 """Depths are at least this, so that weights stay finite."""
 _NEWTON_STEPS = 12
-"""Steps to the Lagrange multiplier; each doubles its digits, and the first ones are good."""
+"""Most steps to the Lagrange multiplier; each doubles its digits, and the first ones are good."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -180,5 +180,7 @@ def secular_multipliers(values: FloatArray, projected: FloatArray, gravity: floa
             square = np.sum(g**2, axis=1, keepdims=True)
             slope = np.sum(g**2 / (values + multiplier), axis=1, keepdims=True)
             step = (np.sqrt(square) / gravity - 1.0) * square / slope
-            multiplier = multiplier + np.where(step > 0.0, step, 0.0)
+            before, multiplier = multiplier, multiplier + np.where(step > 0.0, step, 0.0)
+            if np.array_equal(multiplier, before):
+                break  # all further steps would be the same
     return np.asarray(multiplier)
