@@ -163,6 +163,8 @@ class MonocularStart:
 class ScaleFreeRefinement(DynamicRefinement):
     """The batch problem of a start without an IMU, whose scale is a convention."""
 
+    largest_rise = None
+
     def __init__(self, context: EngineContext) -> None:
         super().__init__(context, "wait")
 

@@ -52,12 +52,17 @@ Again = Callable[[SquareRootInformation, FloatArray], bool]
 """Whether a step (n,) under its posterior asks for one more."""
 
 
+class AstrayError(ArithmeticError):
+    """A step has led so far from where the cost falls that no minimum is to be expected."""
+
+
 def minimize(
     cost: Cost,
     policy: GaussNewtonPolicy,
     linear: Linearization | None = None,
     again: Again | None = None,
     predicted: SquareRootInformation | None = None,
+    largest_rise: float | None = None,
 ) -> Minimum:
     """Take steps on a cost.
 
@@ -67,12 +72,15 @@ def minimize(
         linear: the linearisation at the current estimates, where it is known already.
         again: asks for more steps than the policy has, up to `_MAX_REPEATED_STEPS` in all.
         predicted: what is known without images at the current estimates, where that is known.
+        largest_rise: by Levenberg-Marquardt: how much an undamped step may raise the cost, relative
+            to its value, before it is damped; None for any.
 
     Raises:
         numpy.linalg.LinAlgError: if the cost leaves a variable undetermined.
+        AstrayError: if an undamped step raises the cost by more than it may.
     """
     if policy.damping == "levenberg_marquardt":
-        return _levenberg_marquardt(cost, policy, linear, predicted)
+        return _levenberg_marquardt(cost, policy, linear, predicted, largest_rise)
     linear = linear or cost.linearize(summed=True)
     layout, before = cost.layout(), cost.value(linear, predicted)
     posterior, delta, promised = _step(cost, linear, layout, predicted)
@@ -155,12 +163,16 @@ def _levenberg_marquardt(
     policy: GaussNewtonPolicy,
     linear: Linearization | None,
     predicted: SquareRootInformation | None,
+    largest_rise: float | None,
 ) -> Minimum:
     """Gauss-Newton steps, with damping from the first one on that does not lower the cost."""
     problem = _DampedCost(cost, linear, predicted)
 
     def converged(attempt: Attempt) -> bool:
         if not attempt.accepted:
+            undamped_rise = 0.0 if attempt.damping else attempt.after - attempt.before
+            if largest_rise is not None and undamped_rise > largest_rise * attempt.before:
+                raise AstrayError
             return attempt.predicted < policy.tolerance * attempt.before
         gain = attempt.before - attempt.after
         undamped = 0.0 if attempt.damping else attempt.predicted
