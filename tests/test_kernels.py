@@ -52,6 +52,7 @@ from slam_graph.kernels.projection import (
     to_cameras_numpy,
 )
 from slam_graph.kernels.ray_triangulation import triangulate_rays, triangulate_rays_numpy
+from slam_graph.kernels.secular import secular_roots, secular_roots_numpy
 from slam_graph.kernels.state_rows import fill_state_rows, fill_state_rows_numpy
 from slam_graph.kernels.track_motion import motion_steps, motion_steps_numpy
 from slam_graph.sensors import Camera
@@ -373,6 +374,18 @@ def test_undistort_radtan() -> None:
     q = model.distort(m, coefficients)[0]
     assert same(model.undistort(q, coefficients), m)
     assert same(CameraModel._newton(model, q, coefficients, q, 20), m)
+
+
+def test_secular_roots() -> None:
+    """Of problems of all sizes, and of one without a solution."""
+    rng = np.random.default_rng(8)
+    values = np.sort(10.0 ** rng.uniform(-6.0, 6.0, (60, 3)), axis=1)
+    projected = rng.normal(size=(60, 3)) * 10.0 ** rng.uniform(-6.0, 6.0, (60, 1))
+    values[7], projected[8] = np.nan, 0.0
+    found, expected = (-values[:, 0] + 1e-12 * values[:, 2] for _ in range(2))
+    secular_roots(values, projected, 9.81, 12, found)
+    secular_roots_numpy(values, projected, 9.81, 12, expected)
+    np.testing.assert_array_equal(found, expected)
 
 
 def test_eliminate_features() -> None:

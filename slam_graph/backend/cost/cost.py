@@ -214,12 +214,8 @@ class Cost:
         return total
 
     def _loss(self, obs: Observations, points: FloatArray | None) -> float:
-        errors = np.sqrt(self._squares(obs, points))
+        errors = np.sqrt(self.squared_errors(obs, points))
         return float(np.sum(self.robust.value(errors)))
-
-    def _squares(self, obs: Observations, points: FloatArray | None) -> FloatArray:
-        """What `squared_errors` gives, for the value of the cost."""
-        return self.squared_errors(obs, points)
 
     def squared_errors(self, obs: Observations, points: FloatArray | None) -> FloatArray:
         """Squared residuals (N,) of observations at the current estimates, in units of σ².

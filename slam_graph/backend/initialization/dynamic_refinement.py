@@ -104,10 +104,11 @@ class BatchCost(Cost):
         self.tracks = replace(tracks, points=points)
         self._moved = np.where(better[obs.feature], *squares)
 
-    def _squares(self, obs: Observations, points: FloatArray | None) -> FloatArray:
-        """Squared residuals (N,): after a step those by which it has chosen its features."""
+    def _loss(self, obs: Observations, points: FloatArray | None) -> float:
         known, self._moved = self._moved, None
-        return self.squared_errors(obs, points) if known is None else known
+        if known is None:
+            return super()._loss(obs, points)
+        return float(np.sum(self.robust.value(np.sqrt(known))))
 
     def triangulated(self, obs: Observations) -> Triangulation:
         """Features from the current estimates of the poses."""
@@ -370,6 +371,6 @@ def _scale_sigma(cost: Cost, linear: Linearization, posterior: SquareRootInforma
     by_state = -np.einsum("ji,jin->jn", by_r_1, tracks.T)
     position = Layout(dims_of(keys)).starts[last] + np.arange(3, 6)
     by_state[:, position] -= toward @ pose.rotation().matrix()
-    variances = np.einsum("jn,nm,jm->j", by_state, posterior.covariance_of(keys), by_state)
+    variances = np.sum(by_state @ posterior.covariance_of(keys) * by_state, axis=1)
     variances += np.sum(by_r_1**2, axis=1)
     return float(np.quantile(np.sqrt(variances) / distances, _BEST_FEATURES))

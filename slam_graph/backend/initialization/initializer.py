@@ -29,6 +29,9 @@ STATIC_DISPARITY_PX = 1.5
 running motors shake the image."""
 RETRY_S = 0.2
 """Time between two attempts to start in motion; each takes as long as many frames."""
+LONGEST_RETRY_S = 1.2
+"""The same after several attempts in a row in which features and IMU did not fit one another: it
+doubles with each after the first. What is wrong then does not pass as motion comes."""
 FRAME_SPACING_S = 0.15
 """Time between the frames of a start in motion."""
 _SLACK_NS = 100_000_000
@@ -68,7 +71,7 @@ class Initializer:
         self._refinement = DynamicRefinement(context, unknown_scale or self._config.unknown_scale)
         self._stamps_ns: list[int] = []
         self._frames: list[FeatureFrame] = []
-        self._tried_ns = 0
+        self._tried_ns, self._unfit = 0, 0
         self._rng = np.random.default_rng(0)
         self._standstill = StandstillDetector(
             context.config.zero_velocity, STATIC_DISPARITY_PX, enabled=True
@@ -125,17 +128,29 @@ class Initializer:
 
     def _in_motion(self, stamp_ns: int, frame: FeatureFrame) -> Window | Refusal:
         """A start in motion, or what it waits for."""
-        context, length_s = self._context, self._config.motion_window_s
+        imu, length_s = self._context.imu, self._config.motion_window_s
         length_ns = round(length_s * 1e9)
-        if context.imu.covers(stamp_ns) and len(frame.cameras[0]) >= MIN_FEATURES:
+        if imu.covers(stamp_ns) and len(frame.cameras[0]) >= MIN_FEATURES:
             self._stamps_ns.append(stamp_ns)
             self._frames.append(frame)
         self._forget(stamp_ns, length_ns)
         if not self._stamps_ns or stamp_ns - self._stamps_ns[0] < length_ns:
             return Refusal("frames", f"{length_s:g} s of frames with IMU samples")
-        if stamp_ns - self._tried_ns < round(RETRY_S * 1e9):
+        if stamp_ns - self._tried_ns < round(self._retry_s() * 1e9):
             return self._refusal
         self._tried_ns = stamp_ns
+        outcome = self._attempt()
+        fits = isinstance(outcome, Window) or outcome.kind != "fit"
+        self._unfit = 0 if fits else self._unfit + 1
+        return outcome
+
+    def _retry_s(self) -> float:
+        """Time from the last attempt to the next."""
+        return min(RETRY_S * 2.0 ** max(self._unfit - 1, 0), LONGEST_RETRY_S)
+
+    def _attempt(self) -> Window | Refusal:
+        """A start from the frames of the window, or what it lacks."""
+        context = self._context
         frames = StartFrames.thinned(self._stamps_ns, self._frames, FRAME_SPACING_S)
         turning = context.calibration.turning(frames.stamps_ns, frames.frames, context.imu)
         guess = guess_states(
