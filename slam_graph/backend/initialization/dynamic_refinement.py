@@ -81,7 +81,7 @@ quarter, but for one that was wrong; of 610 attempts that were refused after 15 
 that raised it by more than half, nearly all of them the first."""
 MAX_STEP_LEFT = 0.3
 """Longest accepted step that is left at the end, in σ: with more the steps have not converged."""
-_UNSETTLED = Refusal("fit", "steps that converge")
+_UNSETTLED = Refusal("fit", "steps that converge", lasting=True)
 _BEST_FEATURES = 0.1
 """Quantile of the features' relative distance errors that is taken for the error of the scale."""
 

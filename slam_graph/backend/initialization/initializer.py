@@ -30,8 +30,8 @@ running motors shake the image."""
 RETRY_S = 0.2
 """Time between two attempts to start in motion; each takes as long as many frames."""
 LONGEST_RETRY_S = 1.2
-"""The same after several attempts in a row in which features and IMU did not fit one another: it
-doubles with each after the first. What is wrong then does not pass as motion comes."""
+"""The same after several attempts in a row whose steps did not converge: it doubles with each after
+the first. Such an attempt is among the costliest, and what is wrong then is no lack of motion."""
 FRAME_SPACING_S = 0.15
 """Time between the frames of a start in motion."""
 _SLACK_NS = 100_000_000
@@ -71,7 +71,7 @@ class Initializer:
         self._refinement = DynamicRefinement(context, unknown_scale or self._config.unknown_scale)
         self._stamps_ns: list[int] = []
         self._frames: list[FeatureFrame] = []
-        self._tried_ns, self._unfit = 0, 0
+        self._tried_ns, self._in_vain = 0, 0
         self._rng = np.random.default_rng(0)
         self._standstill = StandstillDetector(
             context.config.zero_velocity, STATIC_DISPARITY_PX, enabled=True
@@ -140,13 +140,13 @@ class Initializer:
             return self._refusal
         self._tried_ns = stamp_ns
         outcome = self._attempt()
-        fits = isinstance(outcome, Window) or outcome.kind != "fit"
-        self._unfit = 0 if fits else self._unfit + 1
+        lasting = isinstance(outcome, Refusal) and outcome.lasting
+        self._in_vain = self._in_vain + 1 if lasting else 0
         return outcome
 
     def _retry_s(self) -> float:
         """Time from the last attempt to the next."""
-        return min(RETRY_S * 2.0 ** max(self._unfit - 1, 0), LONGEST_RETRY_S)
+        return min(RETRY_S * 2.0 ** max(self._in_vain - 1, 0), LONGEST_RETRY_S)
 
     def _attempt(self) -> Window | Refusal:
         """A start from the frames of the window, or what it lacks."""
