@@ -14,7 +14,7 @@ from slam_graph.backend.backend_config import BackendConfig, InitializationConfi
 from slam_graph.backend.cost.feature_tracks import FeatureTracks
 from slam_graph.backend.cost.reprojection import RigProjection
 from slam_graph.backend.estimator import Estimator
-from slam_graph.backend.initialization.dynamic_refinement import BatchCost
+from slam_graph.backend.initialization.batch_cost import BatchCost
 from slam_graph.backend.initialization.dynamic_start import (
     StartFrames,
     StartGuess,

@@ -10,11 +10,17 @@ import numpy as np
 import pytest
 from flight import Flight, packets, rig, room
 
+from slam_graph.arrays import FloatArray
 from slam_graph.backend.backend_config import BackendConfig, InitializationConfig
+from slam_graph.backend.cost.cost import Cost
 from slam_graph.backend.estimator import Estimator
-from slam_graph.backend.initialization.dynamic_refinement import BatchCost, DynamicRefinement
+from slam_graph.backend.initialization import dynamic_refinement
+from slam_graph.backend.initialization.batch_cost import BatchCost
+from slam_graph.backend.initialization.dynamic_refinement import DynamicRefinement
 from slam_graph.backend.initialization.initializer import Initializer
 from slam_graph.backend.initialization.start_diagnosis import Refusal
+from slam_graph.backend.policies import GaussNewtonPolicy
+from slam_graph.backend.solve.square_root import Layout
 from slam_graph.config import load_config
 from slam_graph.sensors.rig import Rig
 
@@ -39,27 +45,67 @@ def flown(mounted: Rig, duration_s: float) -> Iterator[Estimator]:
         yield estimator
 
 
-def test_a_guess_that_leads_astray_is_given_up_after_one_step(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """With 15 steps, twice, such an attempt took ten times as long, and came to the same."""
-    steps: list[int] = []
+@pytest.fixture
+def steps(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """How many steps each refinement takes from now on."""
+    counts: list[int] = []
     apply, refine = BatchCost.apply, DynamicRefinement.refine
 
     def counted(cost: BatchCost, *given: object) -> None:
-        steps[-1] += 1
+        counts[-1] += 1
         apply(cost, *given)
 
     def attempt(refinement: DynamicRefinement, *given: object) -> object:
-        steps.append(0)
+        counts.append(0)
         return refine(refinement, *given)
 
     monkeypatch.setattr(BatchCost, "apply", counted)
     monkeypatch.setattr(DynamicRefinement, "refine", attempt)
+    return counts
+
+
+def test_a_guess_that_leads_astray_is_given_up_after_one_step(steps: list[int]) -> None:
+    """With 15 steps, twice, such an attempt took ten times as long, and came to the same."""
     *_, last = flown(with_twice_the_baseline(rig(2)), 2.0)
     assert len(steps) > 1
     assert set(steps) == {1}
     assert last.waiting_for.startswith("steps that converge")
+
+
+def test_steps_that_do_not_fit_are_given_up(
+    monkeypatch: pytest.MonkeyPatch, steps: list[int]
+) -> None:
+    """By the residuals that are accepted at the end, after a few of them."""
+    monkeypatch.setattr(dynamic_refinement, "_JUDGED_AFTER", 2)
+    monkeypatch.setattr(dynamic_refinement, "MAX_NORMALIZED_COST", 0.1)
+    *_, last = flown(rig(2), 2.0)
+    assert set(steps) == {2}
+    assert last.waiting_for.startswith("steps that converge")
+
+
+def test_steps_that_have_not_converged_are_not_taken_again(
+    monkeypatch: pytest.MonkeyPatch, steps: list[int]
+) -> None:
+    hasty = GaussNewtonPolicy(max_steps=2, tolerance=1e-12, damping="levenberg_marquardt")
+    monkeypatch.setattr(dynamic_refinement, "_BATCH", hasty)
+    *_, last = flown(rig(2), 2.0)
+    assert set(steps) == {2}
+    assert last.waiting_for.startswith("steps that converge")
+
+
+def test_the_factors_of_the_imu_are_linearised_once_at_the_guess(
+    monkeypatch: pytest.MonkeyPatch, steps: list[int]
+) -> None:
+    calls = []
+    rows = Cost.factor_rows
+
+    def counted(cost: Cost, layout: Layout) -> FloatArray:
+        calls.append(cost)
+        return rows(cost, layout)
+
+    monkeypatch.setattr(Cost, "factor_rows", counted)
+    list(flown(with_twice_the_baseline(rig(2)), 2.0))
+    assert len(calls) == len(steps) > 1
 
 
 def attempts_s(monkeypatch: pytest.MonkeyPatch, outcome: Callable[[int], Refusal]) -> list[float]:
