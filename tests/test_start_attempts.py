@@ -129,11 +129,11 @@ UNMOVED = Refusal("motion", "more motion")
 def test_attempts_in_vain_become_rare(monkeypatch: pytest.MonkeyPatch) -> None:
     """Not the first ones, and never more rare than one in 1.2 s."""
     between = attempts_s(monkeypatch, lambda number: UNSETTLED)
-    assert between[:7] == [0.2, 0.2, 0.4, 0.8, 1.2, 1.2, 1.2]
+    assert between[:10] == [*[0.2] * 6, 0.4, 0.8, 1.2, 1.2]
 
 
 def test_a_start_that_waits_for_motion_is_tried_often(monkeypatch: pytest.MonkeyPatch) -> None:
     """Also some time after attempts in vain: each other one takes one of these back."""
     assert set(attempts_s(monkeypatch, lambda number: UNMOVED)) == {0.2}
-    between = attempts_s(monkeypatch, lambda number: UNSETTLED if number < 5 else UNMOVED)
-    assert between[:8] == [0.2, 0.2, 0.4, 0.8, 0.4, 0.2, 0.2, 0.2]
+    between = attempts_s(monkeypatch, lambda number: UNSETTLED if number < 9 else UNMOVED)
+    assert between[5:12] == [0.2, 0.4, 0.8, 0.4, 0.2, 0.2, 0.2]

@@ -29,10 +29,11 @@ STATIC_DISPARITY_PX = 1.5
 running motors shake the image."""
 RETRY_S = 0.2
 """Time between two attempts to start in motion; each takes as long as many frames."""
-_FREE_RETRIES, _MOST_DOUBLINGS, _LONGEST_RETRY_S = 2, 3, 1.2
-"""The time doubles with each attempt after the second whose steps did not converge, up to this.
-Such an attempt is among the costliest, and what is wrong then is no lack of motion: before none of
-250 starts with a right calibration there were more than two in a row."""
+_FREE_RETRIES, _MOST_DOUBLINGS, _LONGEST_RETRY_S = 6, 3, 1.2
+"""The time doubles with each attempt after the sixth whose steps did not converge, up to this. Such
+an attempt is among the costliest, and what is wrong then is no lack of motion: before none of 250
+starts with a right calibration there were more than two in a row, and with focal lengths that are
+10 % too long, where an estimate is still of use, five."""
 FRAME_SPACING_S = 0.15
 """Time between the frames of a start in motion."""
 _SLACK_NS = 100_000_000
