@@ -14,6 +14,7 @@ from slam_graph.backend.backend_config import BackendConfig, InitializationConfi
 from slam_graph.backend.cost.feature_tracks import FeatureTracks
 from slam_graph.backend.cost.reprojection import RigProjection
 from slam_graph.backend.estimator import Estimator
+from slam_graph.backend.initialization.batch_cost import BatchCost
 from slam_graph.backend.initialization.dynamic_start import (
     StartFrames,
     StartGuess,
@@ -22,7 +23,7 @@ from slam_graph.backend.initialization.dynamic_start import (
 from slam_graph.backend.initialization.gyroscope_bias import estimate_gyro_bias
 from slam_graph.backend.initialization.inertial_motion import Intervals, Motion
 from slam_graph.backend.initialization.initializer import FRAME_SPACING_S
-from slam_graph.backend.initialization.start_consensus import static_features
+from slam_graph.backend.initialization.start_consensus import random_samples, static_features
 from slam_graph.backend.initialization.start_diagnosis import Refusal
 from slam_graph.backend.initialization.visual_inertial_alignment import align
 from slam_graph.config import load_config
@@ -108,6 +109,16 @@ def test_the_imu_tells_the_static_world_from_an_object(cameras: int, dynamic: in
     assert (np.sum(~true) > np.sum(true)) == (dynamic > 100)
     assert np.mean(static[true]) > 0.95
     assert np.mean(static[~true]) < 0.05
+
+
+@pytest.mark.parametrize("count", [3, 4, 5, 40, 150])
+def test_samples_are_those_that_numpy_chooses_one_by_one(count: int) -> None:
+    ours, theirs = (np.random.default_rng(count) for _ in range(2))
+    samples = random_samples(count, ours)
+    for sample in samples:
+        chosen = theirs.choice(count, min(4, count), replace=False)
+        assert set(np.flatnonzero(sample)) == set(chosen.tolist())
+    assert ours.random() == theirs.random()
 
 
 def window_of(
@@ -215,6 +226,35 @@ def test_a_simulated_flight_starts_in_motion(cameras: int, seed: int) -> None:
     biases = np.concatenate([state.accel_bias, state.gyro_bias])
     error = biases - np.concatenate([flight.accel_bias, flight.gyro_bias])
     assert error @ np.linalg.solve(state.covariance[9:, 9:], error) < chi2.ppf(0.999, 6)
+
+
+def test_a_step_of_the_refinement_knows_its_cost(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without projecting again what it chose its features by."""
+    values: list[tuple[float, float]] = []
+    value, squared = BatchCost.value, BatchCost.squared_errors
+    projected: list[int] = []
+
+    def both(cost: BatchCost, *given: object) -> float:
+        count = len(projected)
+        known = value(cost, *given)
+        if given[0] is None and len(projected) == count:
+            values.append((known, value(cost, *given)))
+        return known
+
+    def counted(cost: BatchCost, *given: object) -> FloatArray:
+        projected.append(1)
+        return squared(cost, *given)
+
+    monkeypatch.setattr(BatchCost, "value", both)
+    monkeypatch.setattr(BatchCost, "squared_errors", counted)
+    rng, flight = np.random.default_rng(0), Flight()
+    estimator = Estimator(rig(), load_config().algorithm, MOTION)
+    for packet in packets(flight, rig(), room(600, rng), 2.0, rng, 20.0):
+        estimator.add_imu(packet.imu)
+        if estimator.add_frame(packet.frame) is not None:
+            break
+    assert len(values) > 2
+    assert all(known == anew for known, anew in values)
 
 
 def tilt_rad(a: NavState, b: NavState) -> float:

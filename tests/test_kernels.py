@@ -46,11 +46,13 @@ from slam_graph.kernels.patch_search import most_similar, most_similar_numpy
 from slam_graph.kernels.projection import (
     chain_rule,
     chain_rule_numpy,
+    distort_equidistant,
     distort_radtan,
     to_cameras,
     to_cameras_numpy,
 )
 from slam_graph.kernels.ray_triangulation import triangulate_rays, triangulate_rays_numpy
+from slam_graph.kernels.secular import secular_roots, secular_roots_numpy
 from slam_graph.kernels.state_rows import fill_state_rows, fill_state_rows_numpy
 from slam_graph.kernels.track_motion import motion_steps, motion_steps_numpy
 from slam_graph.sensors import Camera
@@ -109,6 +111,22 @@ def test_brown_distortion() -> None:
     for rows, lens, model in (camera == 0, lenses[0], "radtan"), (camera == 1, lenses[1], "none"):
         coefficients = tuple(lens[4:]) if model == "radtan" else ()
         expected = Camera(*lens[:4], model, coefficients, 752, 480).distort(m[rows])
+        assert same(pixels[rows], expected[0])
+        assert same(slopes[rows], expected[1])
+
+
+def test_distort_equidistant() -> None:
+    """Up to 84° off the axis, and on it, where its scale is a limit."""
+    rng = np.random.default_rng(3)
+    m = np.concatenate([rng.uniform(-7.0, 7.0, (40, 2)), [[0, 0], [1e-10, 0], [5e-8, 1e-8]]])
+    camera = rng.integers(0, 2, len(m))
+    lenses = np.array([[190, 191, 254, 256, 3e-3, 7e-4, -2e-3, 2e-4], [1, 2, 3, 4, 0, 0, 0, 0]])
+    pixels, slopes = np.empty((len(m), 2)), np.empty((len(m), 2, 2))
+    distort_equidistant(m, camera, lenses, pixels, slopes)
+    for number, lens in enumerate(lenses):
+        rows = camera == number
+        model = Camera(*lens[:4], "equidistant", tuple(lens[4:]), 512, 512)
+        expected = model.distort(m[rows])
         assert same(pixels[rows], expected[0])
         assert same(slopes[rows], expected[1])
 
@@ -356,6 +374,18 @@ def test_undistort_radtan() -> None:
     q = model.distort(m, coefficients)[0]
     assert same(model.undistort(q, coefficients), m)
     assert same(CameraModel._newton(model, q, coefficients, q, 20), m)
+
+
+def test_secular_roots() -> None:
+    """Of problems of all sizes, and of one without a solution."""
+    rng = np.random.default_rng(8)
+    values = np.sort(10.0 ** rng.uniform(-6.0, 6.0, (60, 3)), axis=1)
+    projected = rng.normal(size=(60, 3)) * 10.0 ** rng.uniform(-6.0, 6.0, (60, 1))
+    values[7], projected[8] = np.nan, 0.0
+    found, expected = (-values[:, 0] + 1e-12 * values[:, 2] for _ in range(2))
+    secular_roots(values, projected, 9.81, 12, found)
+    secular_roots_numpy(values, projected, 9.81, 12, expected)
+    np.testing.assert_array_equal(found, expected)
 
 
 def test_eliminate_features() -> None:

@@ -3,17 +3,26 @@
 """Projection of features into the cameras that observed them.
 
 From the world to the frame of the camera, and the chain rule back to pose and point. Between the
-two the camera model of each camera distorts; for the commonest one that is a kernel, too.
+two the camera model of each camera distorts; for the commonest ones that is a kernel, too.
 """
 
 from __future__ import annotations
+
+import math
 
 import numpy as np
 
 from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.kernels.compilation import compiled
 
-__all__ = ["chain_rule", "chain_rule_numpy", "distort_radtan", "to_cameras", "to_cameras_numpy"]
+__all__ = [
+    "chain_rule",
+    "chain_rule_numpy",
+    "distort_equidistant",
+    "distort_radtan",
+    "to_cameras",
+    "to_cameras_numpy",
+]
 
 
 @compiled(
@@ -128,6 +137,46 @@ def distort_radtan(
         slopes[n, 0, 1] = across * fx
         slopes[n, 1, 0] = across * fy
         slopes[n, 1, 1] = (radial + slope * yy + 6.0 * p1 * y + 2.0 * p2 * x) * fy
+
+
+@compiled("void(f8[:, ::1], i8[:], f8[:, ::1], f8[:, ::1], f8[:, :, ::1])")
+def distort_equidistant(
+    normalized: FloatArray,
+    camera: IntArray,
+    lenses: FloatArray,
+    pixels: FloatArray,
+    slopes: FloatArray,
+) -> None:
+    """Pixels of normalised points under Kannala and Brandt's model, and their derivatives.
+
+    Its NumPy form is `Camera.distort` of each camera.
+
+    Args:
+        normalized: (N, 2).
+        camera: (N,) rows of `lenses`.
+        lenses: (C, 8) fx, fy, cx, cy, k1, k2, k3, k4.
+        pixels: (N, 2), filled.
+        slopes: (N, 2, 2), filled.
+    """
+    for n in range(len(camera)):
+        fx, fy, cx, cy, k1, k2, k3, k4 = lenses[camera[n]]
+        x, y = normalized[n]
+        r = math.hypot(x, y)
+        theta = math.atan(r)
+        t2 = theta * theta
+        scale, radial = 1.0, 0.0
+        if not r <= 1e-9:
+            scale = theta * (1.0 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4)))) / r
+        if not r <= 1e-6:  # d scale / d x = radial * x
+            slope = 1.0 + t2 * (3.0 * k1 + t2 * (5.0 * k2 + t2 * (7.0 * k3 + t2 * 9.0 * k4)))
+            radial = (slope / (1.0 + r * r) - scale) / (r * r)
+        across = radial * x * y
+        pixels[n, 0] = x * scale * fx + cx
+        pixels[n, 1] = y * scale * fy + cy
+        slopes[n, 0, 0] = (scale + radial * x * x) * fx
+        slopes[n, 0, 1] = across * fx
+        slopes[n, 1, 0] = across * fy
+        slopes[n, 1, 1] = (scale + radial * y * y) * fy
 
 
 @compiled(

@@ -19,7 +19,7 @@ m_i follows the estimates, and velocities that are variables have derivatives (`
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass
 from typing import Self
@@ -34,7 +34,12 @@ from slam_graph.backend.cost.row_velocities import RowVelocities, follow_estimat
 from slam_graph.backend.online_calibration import GRAVITY
 from slam_graph.backend.solve.stacked_values import stacked_poses
 from slam_graph.backend.solve.state import FrameMotion, State
-from slam_graph.kernels.projection import chain_rule, distort_radtan, to_cameras
+from slam_graph.kernels.projection import (
+    chain_rule,
+    distort_equidistant,
+    distort_radtan,
+    to_cameras,
+)
 from slam_graph.sensors import Camera, FeatureFrame, Rig
 
 _STILL = FrameMotion(np.zeros(6), 0.0)
@@ -116,7 +121,7 @@ class RigProjection:
         self.body_p_camera = matrices[:, :3, 3]
         self.rolling = rig.rolling
         self.wide = any(camera.model.sees_sideways for camera in self.cameras)
-        self._lenses = _radtan_lenses(self.cameras)
+        self._distort, self._lenses = _lens_kernel(self.cameras)
         self._rig = rig
         self._motions = motions or {}
         self._mounts: tuple[Observations, tuple[FloatArray, FloatArray]] | None = None  # the last
@@ -299,8 +304,8 @@ class RigProjection:
     ) -> tuple[FloatArray, FloatArray]:
         """Pixels (N, 2) of normalised points, and d pixel / d normalised (N, 2, 2)."""
         pixels, slopes = np.empty((len(obs), 2)), np.empty((len(obs), 2, 2))
-        if self._lenses is not None:
-            distort_radtan(normalized, obs.camera, self._lenses, pixels, slopes)
+        if self._distort is not None:
+            self._distort(normalized, obs.camera, self._lenses, pixels, slopes)
             return pixels, slopes
         for number, camera in enumerate(self.cameras):
             rows = np.flatnonzero(obs.camera == number)
@@ -365,10 +370,15 @@ class RigProjection:
         return by_pose, by_point, by_camera_point
 
 
-def _radtan_lenses(cameras: Sequence[Camera]) -> FloatArray | None:
-    """Intrinsics and coefficients (C, 8) of cameras with Brown's model or none; None for others."""
-    if not all(camera.distortion in ("radtan", "none") for camera in cameras):
-        return None
-    straight = (0.0, 0.0, 0.0, 0.0)
+def _lens_kernel(cameras: Sequence[Camera]) -> tuple[Callable[..., None] | None, FloatArray]:
+    """The kernel of the model of some cameras, and their intrinsics and coefficients (C, 8).
+
+    No distortion is Brown's model without any. There is no kernel for other and for mixed models.
+    """
+    models, straight = {camera.distortion for camera in cameras}, (0.0, 0.0, 0.0, 0.0)
     rows = [[*camera.intrinsics, *(camera.coefficients or straight)] for camera in cameras]
-    return np.array(rows, np.float64)
+    if models <= {"radtan", "none"}:
+        return distort_radtan, np.array(rows, np.float64)
+    if models == {"equidistant"}:
+        return distort_equidistant, np.array(rows, np.float64)
+    return None, np.zeros((0, 8))

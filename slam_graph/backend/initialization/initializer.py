@@ -29,6 +29,11 @@ STATIC_DISPARITY_PX = 1.5
 running motors shake the image."""
 RETRY_S = 0.2
 """Time between two attempts to start in motion; each takes as long as many frames."""
+_FREE_RETRIES, _MOST_DOUBLINGS, _LONGEST_RETRY_S = 6, 3, 1.2
+"""The time doubles with each attempt after the sixth whose steps did not converge, up to this. Such
+an attempt is among the costliest, and what is wrong then is no lack of motion: before none of 250
+starts with a right calibration there were more than two in a row, and with focal lengths that are
+10 % too long, where an estimate is still of use, five."""
 FRAME_SPACING_S = 0.15
 """Time between the frames of a start in motion."""
 _SLACK_NS = 100_000_000
@@ -68,7 +73,7 @@ class Initializer:
         self._refinement = DynamicRefinement(context, unknown_scale or self._config.unknown_scale)
         self._stamps_ns: list[int] = []
         self._frames: list[FeatureFrame] = []
-        self._tried_ns = 0
+        self._tried_ns, self._in_vain = 0, 0
         self._rng = np.random.default_rng(0)
         self._standstill = StandstillDetector(
             context.config.zero_velocity, STATIC_DISPARITY_PX, enabled=True
@@ -125,17 +130,31 @@ class Initializer:
 
     def _in_motion(self, stamp_ns: int, frame: FeatureFrame) -> Window | Refusal:
         """A start in motion, or what it waits for."""
-        context, length_s = self._context, self._config.motion_window_s
+        imu, length_s = self._context.imu, self._config.motion_window_s
         length_ns = round(length_s * 1e9)
-        if context.imu.covers(stamp_ns) and len(frame.cameras[0]) >= MIN_FEATURES:
+        if imu.covers(stamp_ns) and len(frame.cameras[0]) >= MIN_FEATURES:
             self._stamps_ns.append(stamp_ns)
             self._frames.append(frame)
         self._forget(stamp_ns, length_ns)
         if not self._stamps_ns or stamp_ns - self._stamps_ns[0] < length_ns:
             return Refusal("frames", f"{length_s:g} s of frames with IMU samples")
-        if stamp_ns - self._tried_ns < round(RETRY_S * 1e9):
+        if stamp_ns - self._tried_ns < round(self._retry_s() * 1e9):
             return self._refusal
         self._tried_ns = stamp_ns
+        outcome = self._attempt()
+        lasting = isinstance(outcome, Refusal) and outcome.lasting
+        in_vain = self._in_vain + (1 if lasting else -1)
+        self._in_vain = min(max(in_vain, 0), _FREE_RETRIES + _MOST_DOUBLINGS)
+        return outcome
+
+    def _retry_s(self) -> float:
+        """Time from the last attempt to the next."""
+        doublings = max(self._in_vain - _FREE_RETRIES, 0)
+        return min(RETRY_S * 2.0**doublings, _LONGEST_RETRY_S)
+
+    def _attempt(self) -> Window | Refusal:
+        """A start from the frames of the window, or what it lacks."""
+        context = self._context
         frames = StartFrames.thinned(self._stamps_ns, self._frames, FRAME_SPACING_S)
         turning = context.calibration.turning(frames.stamps_ns, frames.frames, context.imu)
         guess = guess_states(

@@ -28,10 +28,10 @@ from slam_graph.backend.cost.cost import Linearization
 from slam_graph.backend.cost.imu_factor import imu_factor
 from slam_graph.backend.dynamics import bias_covariance
 from slam_graph.backend.engine_protocol import EngineContext
+from slam_graph.backend.initialization.batch_cost import BatchCost
 from slam_graph.backend.initialization.dynamic_refinement import (
     MAX_NORMALIZED_COST,
     MAX_STEP_LEFT,
-    BatchCost,
     DynamicRefinement,
     prior_factors,
 )
@@ -162,6 +162,8 @@ class MonocularStart:
 
 class ScaleFreeRefinement(DynamicRefinement):
     """The batch problem of a start without an IMU, whose scale is a convention."""
+
+    gives_up = False
 
     def __init__(self, context: EngineContext) -> None:
         super().__init__(context, "wait")

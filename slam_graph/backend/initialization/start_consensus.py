@@ -71,28 +71,26 @@ class _Model:
         away[:, :, 3:6] -= 0.5 * mean(t**2)[:, None, None] * np.eye(3)
         for axis, column in enumerate(motion.displacements[obs.frame].T):
             away[:, axis, 6] += mean(column)
-        self._away = away
+        self._away = np.ascontiguousarray(away.reshape(-1, 7).T)  # (7, 3 J)
 
     def solve(self, weights: FloatArray) -> FloatArray:
         """Motions (S, 6) from features weighted by (S, J); not finite where undetermined."""
         M = (weights**2 @ self._squares).reshape(-1, 7, 7)
         return constrained_solutions(M, self._gravity)
 
-    def distances(self, x: FloatArray) -> FloatArray:
-        """Mean distances (S, J) of the features from the body under motions x (S, 6), m."""
-        away = np.einsum("jki,si->sjk", self._away, _extended(x))
-        return np.asarray(np.maximum(np.linalg.norm(away, axis=2), MIN_DEPTH_M))
+    def errors(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """What the features say of motions x (S, 6).
 
-    def errors(self, x: FloatArray) -> FloatArray:
-        """Mean squared residual (S, J) of the features on the plane z = 1 under motions (S, 6)."""
-        y = _extended(x)
+        Returns:
+            Their mean squared residual (S, J) on the plane z = 1, and their mean distances (S, J)
+            from the body, m.
+        """
+        y = np.column_stack([x, -np.ones(len(x))])  # with the factor of the right-hand side
         squares = (y[:, :, None] * y[:, None, :]).reshape(-1, 49) @ self._squares.T
-        return np.asarray(np.maximum(squares, 0.0) / self._dof / self.distances(x) ** 2)
-
-
-def _extended(x: FloatArray) -> FloatArray:
-    """Motions (S, 7) with the factor of the right-hand side."""
-    return np.column_stack([x, -np.ones(len(x))])
+        away = y @ self._away
+        distances = np.sqrt(np.add.reduce((away * away).reshape(len(x), -1, 3), axis=2))
+        distances = np.maximum(distances, MIN_DEPTH_M)
+        return np.maximum(squares, 0.0) / self._dof / distances**2, distances
 
 
 def constrained_solutions(M: FloatArray, gravity: float) -> FloatArray:
@@ -119,6 +117,29 @@ def constrained_solutions(M: FloatArray, gravity: float) -> FloatArray:
     return np.concatenate([v, g], axis=1)
 
 
+def random_samples(count: int, rng: np.random.Generator) -> FloatArray:
+    """Which of some features are in each sample (S, J): ones, and zeros elsewhere.
+
+    Floyd's algorithm for all samples at once: of the numbers from 0 to j the one that is drawn, or
+    j if the sample has that one. The draws are those of `rng.choice` for one sample after the
+    other, those by which it shuffles included, and so are the samples; it takes fifty times as
+    long.
+
+    Args:
+        count: number of features, J.
+        rng: draws them.
+    """
+    size = min(_SAMPLE_FEATURES, count)
+    last = np.arange(count - size, count)
+    most = np.concatenate([last, np.arange(size - 1, 0, -1)])
+    drawn = rng.integers(0, most, (_SAMPLES, len(most)), endpoint=True)
+    samples, rows = np.zeros((_SAMPLES, count)), np.arange(_SAMPLES)
+    for column, j in enumerate(last):
+        number = drawn[:, column]
+        samples[rows, np.where(samples[rows, number] == 0.0, number, j)] = 1.0
+    return samples
+
+
 def static_features(
     obs: Observations,
     motion: Motion,
@@ -140,22 +161,18 @@ def static_features(
     model, count, limit = _Model(obs, motion, rig, gravity), len(obs.ids), tolerance**2
 
     def scores(x: FloatArray) -> FloatArray:
-        return np.asarray(np.sum(np.minimum(model.errors(x), limit), axis=1))
+        return np.asarray(np.sum(np.minimum(model.errors(x)[0], limit), axis=1))
 
-    chosen = np.zeros((1 + _SAMPLES, count))
-    chosen[0] = 1.0
-    for sample in range(1, len(chosen)):
-        features = rng.choice(count, min(_SAMPLE_FEATURES, count), replace=False)
-        chosen[sample, features] = 1.0
-    motions = model.solve(chosen)
+    motions = model.solve(np.vstack([np.ones(count), random_samples(count, rng)]))
     motions = motions[np.isfinite(motions).all(axis=1)]
     if not len(motions):
         return np.ones(count, np.bool_)
     best = motions[np.argsort(scores(motions), kind="stable")[:_REFINED]]
     for _ in range(_REFINEMENTS):
-        agree = model.errors(best) < limit
-        better = model.solve(agree / model.distances(best))
+        errors, distances = model.errors(best)
+        agree = errors < limit
+        better = model.solve(agree / distances)
         known = np.asarray(np.isfinite(better).all(axis=1, keepdims=True))
         best = np.where(known & agree.any(axis=1, keepdims=True), better, best)
     x = best[[int(np.argmin(scores(best)))]]
-    return np.asarray(np.ravel(model.errors(x)) < limit)
+    return np.asarray(np.ravel(model.errors(x)[0]) < limit)

@@ -34,10 +34,12 @@ class Refusal:
         kind: what is missing: frames or IMU samples, features that last, motion that shows what
             must be known, or features and IMU that fit one another; `rest` is for a standstill.
         needs: the same in words, with the numbers of the attempt.
+        lasting: whether it is not to be expected that a few more frames bring it.
     """
 
     kind: Literal["frames", "tracks", "motion", "fit", "rest"]
     needs: str
+    lasting: bool = False
 
 
 def likeliest_cause(

@@ -24,13 +24,14 @@ from slam_graph.backend.cost.feature_tracks import Observations
 from slam_graph.backend.cost.reprojection import RigProjection
 from slam_graph.backend.initialization.inertial_motion import Motion
 from slam_graph.backend.solve.square_root import triangularize
+from slam_graph.kernels.secular import secular_roots
 
 _REWEIGHTINGS = 2
 """How often the equations are weighted again by the inverse depths of their solution."""
 MIN_DEPTH_M = 0.1
 """Depths are at least this, so that weights stay finite."""
 _NEWTON_STEPS = 12
-"""Steps to the Lagrange multiplier; each doubles its digits, and the first ones are good."""
+"""Most steps to the Lagrange multiplier; each doubles its digits, and the first ones are good."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -173,12 +174,6 @@ def secular_multipliers(values: FloatArray, projected: FloatArray, gravity: floa
         projected: (S, 3) right-hand sides in the basis of its eigenvectors.
         gravity: its magnitude, m/s².
     """
-    multiplier = -values[:, :1] + 1e-12 * np.maximum(values[:, 2:], 1e-12)
-    with np.errstate(all="ignore"):
-        for _ in range(_NEWTON_STEPS):
-            g = projected / (values + multiplier)
-            square = np.sum(g**2, axis=1, keepdims=True)
-            slope = np.sum(g**2 / (values + multiplier), axis=1, keepdims=True)
-            step = (np.sqrt(square) / gravity - 1.0) * square / slope
-            multiplier = multiplier + np.where(step > 0.0, step, 0.0)
-    return np.asarray(multiplier)
+    multipliers = -values[:, 0] + 1e-12 * np.maximum(values[:, 2], 1e-12)
+    secular_roots(values, projected, gravity, _NEWTON_STEPS, multipliers)
+    return np.asarray(multipliers[:, None])

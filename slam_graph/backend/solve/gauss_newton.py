@@ -41,15 +41,25 @@ class Minimum:
         costs: the cost before the first step and after each step that was taken; of a single step
             that nothing depends on by what it promised, which takes no time.
         repeated: whether there were more steps than the policy has, because one was too large.
+        converged: with damping: whether the steps ended because the cost fell no more.
     """
 
     posterior: SquareRootInformation
     costs: tuple[float, ...]
     repeated: bool = False
+    converged: bool = True
 
 
 Again = Callable[[SquareRootInformation, FloatArray], bool]
 """Whether a step (n,) under its posterior asks for one more."""
+
+
+Hopeful = Callable[[Attempt], bool]
+"""Whether it is worth to go on after a step that was tried."""
+
+
+class HopelessError(ArithmeticError):
+    """Steps were given up, as nothing good was to be expected of them."""
 
 
 def minimize(
@@ -58,6 +68,7 @@ def minimize(
     linear: Linearization | None = None,
     again: Again | None = None,
     predicted: SquareRootInformation | None = None,
+    hopeful: Hopeful | None = None,
 ) -> Minimum:
     """Take steps on a cost.
 
@@ -67,12 +78,14 @@ def minimize(
         linear: the linearisation at the current estimates, where it is known already.
         again: asks for more steps than the policy has, up to `_MAX_REPEATED_STEPS` in all.
         predicted: what is known without images at the current estimates, where that is known.
+        hopeful: is asked after each step of Levenberg-Marquardt.
 
     Raises:
         numpy.linalg.LinAlgError: if the cost leaves a variable undetermined.
+        HopelessError: if `hopeful` says that it is not worth to go on.
     """
     if policy.damping == "levenberg_marquardt":
-        return _levenberg_marquardt(cost, policy, linear, predicted)
+        return _levenberg_marquardt(cost, policy, linear, predicted, hopeful)
     linear = linear or cost.linearize(summed=True)
     layout, before = cost.layout(), cost.value(linear, predicted)
     posterior, delta, promised = _step(cost, linear, layout, predicted)
@@ -155,11 +168,14 @@ def _levenberg_marquardt(
     policy: GaussNewtonPolicy,
     linear: Linearization | None,
     predicted: SquareRootInformation | None,
+    hopeful: Hopeful | None,
 ) -> Minimum:
     """Gauss-Newton steps, with damping from the first one on that does not lower the cost."""
     problem = _DampedCost(cost, linear, predicted)
 
     def converged(attempt: Attempt) -> bool:
+        if hopeful is not None and not hopeful(attempt):
+            raise HopelessError
         if not attempt.accepted:
             return attempt.predicted < policy.tolerance * attempt.before
         gain = attempt.before - attempt.after
@@ -168,7 +184,7 @@ def _levenberg_marquardt(
 
     damping = TenfoldDamping(_INITIAL_DAMPING, _MAX_DAMPING)
     steps = levenberg_marquardt(problem, policy.max_steps, converged, damping)
-    return Minimum(problem.posterior(), steps.costs)
+    return Minimum(problem.posterior(), steps.costs, converged=steps.converged)
 
 
 class _DampedCost:
