@@ -56,8 +56,21 @@ POSE_SELECTIONS: Registry[PoseSelector] = Registry("slam_graph.pose_selections",
 
 @POSE_SELECTIONS.register("most_recent")
 def most_recent(window: Window, policy: CostPolicy, rig: RigProjection) -> PoseSelection:
-    """The latest poses. When the oldest leaves, the features that it saw are used."""
-    return PoseSelection(window.past[-policy.max_past_poses :])
+    """The latest poses that are far enough apart in time.
+
+    When the oldest leaves, the features that it saw are used. One that is too close to the pose
+    before it leaves at once, and its observations are dropped: a fast camera would fill the window
+    with one view, and its features would have little parallax.
+    """
+    spacing_ns, stamps_ns = policy.pose_spacing_s * 1e9, window.past_stamps_ns
+    count = max(len(window.past) - (policy.recent_frames - 1), 0)
+    kept = window.past[:1]
+    for frame in window.past[1:count]:
+        if stamps_ns[frame] - stamps_ns[kept[-1]] >= spacing_ns:
+            kept.append(frame)
+    dropped = frozenset(window.past[:count]).difference(kept)
+    kept += window.past[max(count, 1) :]
+    return PoseSelection(kept[-policy.max_past_poses :], dropped)
 
 
 @POSE_SELECTIONS.register("evenly_spaced")
