@@ -3,6 +3,7 @@
 """Policies of one's own are treated by what they say of themselves, not by their names."""
 
 from collections.abc import Iterator
+from typing import cast
 
 import numpy as np
 import pytest
@@ -11,8 +12,10 @@ from pydantic import ValidationError
 from slam_graph.arrays import BoolArray
 from slam_graph.backend import FEATURE_POLICIES, POSE_SELECTIONS, FeaturePolicy, PoseSelection
 from slam_graph.backend.cost.reprojection import RigProjection
-from slam_graph.backend.cost.selection_policies import WaitingTracks
+from slam_graph.backend.cost.selection_policies import WaitingTracks, most_recent
 from slam_graph.backend.policies import CostPolicy
+from slam_graph.backend.solve.square_root import SquareRootInformation
+from slam_graph.backend.solve.state import State
 from slam_graph.backend.window import Window
 
 
@@ -75,3 +78,27 @@ def test_a_track_longer_than_the_poses_is_refused(past_poses: str) -> None:
 def test_how_long_a_track_is_under_poses_from_outside_is_not_known() -> None:
     policy = CostPolicy(past_poses="all", max_past_poses=3, state_feature_frames=20)
     assert policy.frames_before_state == 20
+
+
+@pytest.mark.parametrize("recent_frames", [1, 3])
+def test_poses_of_a_fast_camera_are_kept_apart_in_time(recent_frames: int) -> None:
+    """At 60 Hz every third pose stays, and at 20 Hz all; the others leave at once."""
+    policy = CostPolicy(max_past_poses=6, recent_frames=recent_frames)
+    rig = cast(RigProjection, None)
+    for rate_hz, every in ((60, 3), (30, 2), (20, 1)):
+        window = Window(0, 0, State(), SquareRootInformation.empty())
+        for frame in range(40):
+            window.past.append(frame)
+            window.past_stamps_ns[frame] = round(frame * 1e9 / rate_hz)
+            selected = most_recent(window, policy, rig)
+            assert window.past[-1] in selected.kept or recent_frames == 1
+            window.past = selected.kept
+        older = selected.kept[: len(selected.kept) - (recent_frames - 1)]
+        assert np.diff(older).tolist() == [every] * (len(older) - 1)
+        assert len(selected.kept) == policy.max_past_poses
+        assert not selected.dropped.intersection(selected.kept)
+
+
+def test_the_spacing_of_poses_is_refused_where_it_has_no_effect() -> None:
+    with pytest.raises(ValidationError, match="keeps no poses by their time"):
+        CostPolicy(past_poses="evenly_spaced", pose_spacing_s=0.1)
