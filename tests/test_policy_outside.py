@@ -3,10 +3,10 @@
 """Policies of one's own are treated by what they say of themselves, not by their names."""
 
 from collections.abc import Iterator
-from typing import cast
 
 import numpy as np
 import pytest
+from flight import rig
 from pydantic import ValidationError
 
 from slam_graph.arrays import BoolArray
@@ -81,22 +81,27 @@ def test_how_long_a_track_is_under_poses_from_outside_is_not_known() -> None:
 
 
 @pytest.mark.parametrize("recent_frames", [1, 3])
-def test_poses_of_a_fast_camera_are_kept_apart_in_time(recent_frames: int) -> None:
-    """At 60 Hz every third pose stays, and at 20 Hz all; the others leave at once."""
-    policy = CostPolicy(max_past_poses=6, recent_frames=recent_frames)
-    rig = cast(RigProjection, None)
-    for rate_hz, every in ((60, 3), (30, 2), (20, 1)):
-        window = Window(0, 0, State(), SquareRootInformation.empty())
-        for frame in range(40):
-            window.past.append(frame)
-            window.past_stamps_ns[frame] = round(frame * 1e9 / rate_hz)
-            selected = most_recent(window, policy, rig)
-            assert window.past[-1] in selected.kept or recent_frames == 1
-            window.past = selected.kept
-        older = selected.kept[: len(selected.kept) - (recent_frames - 1)]
-        assert np.diff(older).tolist() == [every] * (len(older) - 1)
-        assert len(selected.kept) == policy.max_past_poses
-        assert not selected.dropped.intersection(selected.kept)
+@pytest.mark.parametrize(
+    ("spacing_s", "cameras", "rate_hz", "every"),
+    [(None, 1, 60, 3), (None, 1, 30, 2), (None, 1, 20, 1), (None, 2, 60, 1), (0.03, 2, 60, 2)],
+)
+def test_poses_of_one_fast_camera_are_kept_apart_in_time(
+    spacing_s: float | None, cameras: int, rate_hz: int, every: int, recent_frames: int
+) -> None:
+    policy = CostPolicy(max_past_poses=6, recent_frames=recent_frames, pose_spacing_s=spacing_s)
+    projection = RigProjection(rig(cameras))
+    window = Window(0, 0, State(), SquareRootInformation.empty())
+    for frame in range(40):
+        window.past.append(frame)
+        window.past_stamps_ns[frame] = round(frame * 1e9 / rate_hz)
+        selected = most_recent(window, policy, projection)
+        dropped = selected.dropped
+        assert recent_frames == 1 or frame in selected.kept
+        assert dropped.issubset(window.past) and not dropped.intersection(selected.kept)
+        window.past = selected.kept
+    older = selected.kept[: len(selected.kept) - (recent_frames - 1)]
+    assert np.diff(older).tolist() == [every] * (len(older) - 1)
+    assert len(selected.kept) == policy.max_past_poses
 
 
 def test_the_spacing_of_poses_is_refused_where_it_has_no_effect() -> None:

@@ -46,6 +46,10 @@ class PoseSelection:
     keyframes: frozenset[int] = frozenset()
 
 
+_POSE_SPACING_S = 0.045
+"""Least time between the poses of one camera. A camera of 20 Hz keeps all, also where its frames
+jitter by some milliseconds."""
+
 PoseSelector = Callable[["Window", "CostPolicy", "RigProjection"], PoseSelection]
 """Selects among `window.past`, with the current frame's observations in `window.tracks`; it must
 not change the window."""
@@ -59,10 +63,14 @@ def most_recent(window: Window, policy: CostPolicy, rig: RigProjection) -> PoseS
     """The latest poses that are far enough apart in time.
 
     When the oldest leaves, the features that it saw are used. One that is too close to the pose
-    before it leaves at once, and its observations are dropped: a fast camera would fill the window
-    with one view, and its features would have little parallax.
+    before it leaves at once, and its observations are dropped: one fast camera would fill the
+    window with one view, and its features would have little parallax. Several cameras have parallax
+    at once, and what counts is the number of observations.
     """
-    spacing_ns, stamps_ns = policy.pose_spacing_s * 1e9, window.past_stamps_ns
+    spacing_s = policy.pose_spacing_s
+    if spacing_s is None:
+        spacing_s = _POSE_SPACING_S if len(rig.cameras) == 1 else 0.0
+    spacing_ns, stamps_ns = round(spacing_s * 1e9), window.past_stamps_ns
     count = max(len(window.past) - (policy.recent_frames - 1), 0)
     kept = window.past[:1]
     for frame in window.past[1:count]:
