@@ -3,6 +3,7 @@
 """Policies of one's own are treated by what they say of themselves, not by their names."""
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -82,14 +83,26 @@ def test_how_long_a_track_is_under_poses_from_outside_is_not_known() -> None:
 
 @pytest.mark.parametrize("recent_frames", [1, 3])
 @pytest.mark.parametrize(
-    ("spacing_s", "cameras", "rate_hz", "every"),
-    [(None, 1, 60, 3), (None, 1, 30, 2), (None, 1, 20, 1), (None, 2, 60, 1), (0.03, 2, 60, 2)],
+    ("spacing_s", "cameras", "imu", "rate_hz", "every"),
+    [
+        (None, 1, True, 60, 3),
+        (None, 1, True, 30, 2),
+        (None, 1, True, 20, 1),
+        (None, 2, True, 60, 1),
+        (None, 1, False, 60, 1),
+        (0.03, 2, True, 60, 2),
+    ],
 )
 def test_poses_of_one_fast_camera_are_kept_apart_in_time(
-    spacing_s: float | None, cameras: int, rate_hz: int, every: int, recent_frames: int
+    spacing_s: float | None,
+    cameras: int,
+    imu: bool,
+    rate_hz: int,
+    every: int,
+    recent_frames: int,
 ) -> None:
     policy = CostPolicy(max_past_poses=6, recent_frames=recent_frames, pose_spacing_s=spacing_s)
-    projection = RigProjection(rig(cameras))
+    projection = RigProjection(replace(rig(cameras), has_imu=imu))
     window = Window(0, 0, State(), SquareRootInformation.empty())
     for frame in range(40):
         window.past.append(frame)
@@ -97,7 +110,8 @@ def test_poses_of_one_fast_camera_are_kept_apart_in_time(
         selected = most_recent(window, policy, projection)
         dropped = selected.dropped
         assert recent_frames == 1 or frame in selected.kept
-        assert dropped.issubset(window.past) and not dropped.intersection(selected.kept)
+        assert dropped.issubset(window.past)
+        assert not dropped.intersection(selected.kept)
         window.past = selected.kept
     older = selected.kept[: len(selected.kept) - (recent_frames - 1)]
     assert np.diff(older).tolist() == [every] * (len(older) - 1)

@@ -47,7 +47,8 @@ class CostPolicy(Settings):
     pose_spacing_s: float | None = expert(None, ge=0)
     """Of past_poses: most_recent. A pose that is closer in time to the one before it does not stay,
     so that the window of a fast camera is not too short. 0 keeps all. Not given: 0.045 with one
-    camera (of 20 Hz all poses stay, of 30 Hz every second one, of 60 Hz every third), else 0."""
+    camera and an IMU (of 20 Hz all poses stay, of 30 Hz every second one, of 60 Hz every third),
+    else 0."""
     recent_frames: int = Field(1, ge=1)
     """How many of the last frames keep their velocity and bias; 1 is the current one only. The IMU
     factors between them are linearised anew in every step. Raise it with `keyframes`, which need

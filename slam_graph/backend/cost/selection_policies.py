@@ -47,7 +47,7 @@ class PoseSelection:
 
 
 _POSE_SPACING_S = 0.045
-"""Least time between the poses of one camera. A camera of 20 Hz keeps all, also where its frames
+"""Least time between the poses of one camera with an IMU. A camera of 20 Hz keeps all, also where its frames
 jitter by some milliseconds."""
 
 PoseSelector = Callable[["Window", "CostPolicy", "RigProjection"], PoseSelection]
@@ -65,11 +65,11 @@ def most_recent(window: Window, policy: CostPolicy, rig: RigProjection) -> PoseS
     When the oldest leaves, the features that it saw are used. One that is too close to the pose
     before it leaves at once, and its observations are dropped: one fast camera would fill the
     window with one view, and its features would have little parallax. Several cameras have parallax
-    at once, and what counts is the number of observations.
+    at once, and what counts is the number of observations, as without an IMU.
     """
     spacing_s = policy.pose_spacing_s
     if spacing_s is None:
-        spacing_s = _POSE_SPACING_S if len(rig.cameras) == 1 else 0.0
+        spacing_s = _POSE_SPACING_S if rig.has_imu and len(rig.cameras) == 1 else 0.0
     spacing_ns, stamps_ns = round(spacing_s * 1e9), window.past_stamps_ns
     count = max(len(window.past) - (policy.recent_frames - 1), 0)
     kept = window.past[:1]
