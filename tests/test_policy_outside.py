@@ -120,4 +120,4 @@ def test_poses_of_one_fast_camera_are_kept_apart_in_time(
 
 def test_the_spacing_of_poses_is_refused_where_it_has_no_effect() -> None:
     with pytest.raises(ValidationError, match="keeps no poses by their time"):
-        CostPolicy(past_poses="evenly_spaced", pose_spacing_s=0.1)
+        CostPolicy(past_poses="keyframes", pose_spacing_s=0.1)
