@@ -51,6 +51,10 @@ _GAINED_SPEED = 0.02
 """Change of velocity, beyond what the noise of the IMU gives, that ends a standstill, m/s. It sees
 a take-off that noisy images do not see yet."""
 
+_TAKE_OFF_SIGMAS = 10.0
+"""Standard deviation of the velocity, in units of what was gained within that limit. The frames of
+a take-off all err in its direction, and each factor is taken for a measurement of its own."""
+
 _BRIDGE = 2.0
 """Largest value of a Brownian bridge of unit variance: exceeded with a probability of 7e-4."""
 
@@ -222,7 +226,9 @@ class StandstillDetector:
         if np.max(np.std(recent.accel, axis=0)) >= self._config.max_accel_std:
             return None
         gained = _gained_speed(recent)
-        return math.hypot(VELOCITY_SIGMA, max(gained, 0.0)) if gained < _GAINED_SPEED else None
+        if gained >= _GAINED_SPEED:
+            return None
+        return math.hypot(VELOCITY_SIGMA, _TAKE_OFF_SIGMAS * max(gained, 0.0))
 
 
 def _gained_speed(imu: ImuData) -> float:
