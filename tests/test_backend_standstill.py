@@ -136,16 +136,41 @@ def test_without_imu_there_is_no_evidence() -> None:
     assert not any(detector.is_still(ImuBuffer(), t, FeatureFrame(t, (seen,))) for t in stamps)
 
 
+@pytest.mark.parametrize(("accel_mps2", "since_s"), [(0.0, 0.0), (0.2, 0.08), (0.1, 0.15)])
+def test_a_velocity_that_the_imu_has_gained_is_not_taken_for_zero(
+    accel_mps2: float, since_s: float
+) -> None:
+    """The first frames of a take-off pass the limits; their velocity is within its sigma."""
+    stamps_s = np.arange(0.0, 1.5, 0.005)
+    rng = np.random.default_rng(1)
+    accel = np.array([0.3, 0.2, 9.8]) + rng.normal(0.0, 0.02, (len(stamps_s), 3))
+    accel[stamps_s > stamps_s[-1] - since_s, 0] += accel_mps2
+    imu = ImuBuffer()
+    imu.add(ImuData(np.round(stamps_s * 1e9).astype(np.int64), 0.0 * accel, accel))
+    detector, home = StandstillDetector(CONFIG), rng.uniform(50.0, 400.0, (40, 2))
+    for stamp_s in stamps_s[::10].tolist() + stamps_s[-1:].tolist():
+        pixels = home + rng.normal(0.0, 0.5, home.shape)
+        seen = FeatureObservations(np.arange(40), pixels, pixels / 400.0)
+        stamp_ns = round(stamp_s * 1e9)
+        still = detector.is_still(imu, stamp_ns, FeatureFrame(stamp_ns, (seen,)))
+        assert still == (detector.velocity_sigma is not None)
+    sigma, gained = detector.velocity_sigma, accel_mps2 * since_s
+    assert sigma is not None
+    assert (sigma > VELOCITY_SIGMA) == (gained > 0.0)
+    assert gained < 1.2 * sigma
+
+
 def test_the_factors_hold_the_pose_and_stop_the_velocity() -> None:
     pose = gtsam.Pose3(gtsam.Rot3.RzRyRx(0.1, 0.2, 0.3), np.array([1.0, 2.0, 3.0]))
     values = gtsam.Values()
     for i in (3, 4):
         values.insert(X(i), pose)
         values.insert(V(i), np.zeros(3))
-    factors = zero_velocity_factors(3, 4)
+    factors, looser = (zero_velocity_factors(3, 4, k * VELOCITY_SIGMA) for k in (1.0, 2.0))
     assert sum(f.error(values) for f in factors) == 0.0
     values.update(V(4), np.array([VELOCITY_SIGMA, 0.0, 0.0]))
     assert sum(f.error(values) for f in factors) == pytest.approx(0.5)
+    assert sum(f.error(values) for f in looser) == pytest.approx(0.125)
     values.update(X(4), pose.retract(np.array([0, 0, 0, 0, POSITION_SIGMA, 0.0])))
     assert sum(f.error(values) for f in factors) == pytest.approx(1.0)
 

@@ -3,16 +3,20 @@
 """Policies of one's own are treated by what they say of themselves, not by their names."""
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 import pytest
+from flight import rig
 from pydantic import ValidationError
 
 from slam_graph.arrays import BoolArray
 from slam_graph.backend import FEATURE_POLICIES, POSE_SELECTIONS, FeaturePolicy, PoseSelection
 from slam_graph.backend.cost.reprojection import RigProjection
-from slam_graph.backend.cost.selection_policies import WaitingTracks
+from slam_graph.backend.cost.selection_policies import WaitingTracks, most_recent
 from slam_graph.backend.policies import CostPolicy
+from slam_graph.backend.solve.square_root import SquareRootInformation
+from slam_graph.backend.solve.state import State
 from slam_graph.backend.window import Window
 
 
@@ -75,3 +79,45 @@ def test_a_track_longer_than_the_poses_is_refused(past_poses: str) -> None:
 def test_how_long_a_track_is_under_poses_from_outside_is_not_known() -> None:
     policy = CostPolicy(past_poses="all", max_past_poses=3, state_feature_frames=20)
     assert policy.frames_before_state == 20
+
+
+@pytest.mark.parametrize("recent_frames", [1, 3])
+@pytest.mark.parametrize(
+    ("spacing_s", "cameras", "imu", "rate_hz", "every"),
+    [
+        (None, 1, True, 60, 3),
+        (None, 1, True, 30, 2),
+        (None, 1, True, 20, 1),
+        (None, 2, True, 60, 1),
+        (None, 1, False, 60, 1),
+        (0.03, 2, True, 60, 2),
+    ],
+)
+def test_poses_of_one_fast_camera_are_kept_apart_in_time(
+    spacing_s: float | None,
+    cameras: int,
+    imu: bool,
+    rate_hz: int,
+    every: int,
+    recent_frames: int,
+) -> None:
+    policy = CostPolicy(max_past_poses=6, recent_frames=recent_frames, pose_spacing_s=spacing_s)
+    projection = RigProjection(replace(rig(cameras), has_imu=imu))
+    window = Window(0, 0, State(), SquareRootInformation.empty())
+    for frame in range(40):
+        window.past.append(frame)
+        window.past_stamps_ns[frame] = round(frame * 1e9 / rate_hz)
+        selected = most_recent(window, policy, projection)
+        dropped = selected.dropped
+        assert recent_frames == 1 or frame in selected.kept
+        assert dropped.issubset(window.past)
+        assert not dropped.intersection(selected.kept)
+        window.past = selected.kept
+    older = selected.kept[: len(selected.kept) - (recent_frames - 1)]
+    assert np.diff(older).tolist() == [every] * (len(older) - 1)
+    assert len(selected.kept) == policy.max_past_poses
+
+
+def test_the_spacing_of_poses_is_refused_where_it_has_no_effect() -> None:
+    with pytest.raises(ValidationError, match="keeps no poses by their time"):
+        CostPolicy(past_poses="keyframes", pose_spacing_s=0.1)

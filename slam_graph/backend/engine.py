@@ -41,19 +41,24 @@ class SquareRootEngine:
         self._cost: Cost | None = None
 
     def step(
-        self, window: Window, stamp_ns: int, frame: FeatureFrame, still: bool, report: StepReport
+        self,
+        window: Window,
+        stamp_ns: int,
+        frame: FeatureFrame,
+        still_sigma: float | None,
+        report: StepReport,
     ) -> NavState:
         """One turn of the loop: the three modules, in order."""
         context = self._context
         with report.timed("propagation"):
             corrected = context.by_images(frame, window.points)
-            context.propagation.append_frame(window, context.imu, stamp_ns, still, corrected)
+            context.propagation.append_frame(window, context.imu, stamp_ns, still_sigma, corrected)
             context.add_observations(window, frame)
         with report.timed("cost"):
-            if not still:
+            if still_sigma is None:
                 add_drift_noise(window, context.projection, context.pixels.drift.sigma_px)
                 window.recall_features()
-            constructed = self._construction.construct(window, still)
+            constructed = self._construction.construct(window, still_sigma is not None)
         with report.timed("gauss_newton"):
             constructed, minimum = self._minimize(window, constructed)
             self._construction.reject_residuals(window, constructed)

@@ -147,7 +147,12 @@ class Engine(Protocol):
     """Estimates a state for each frame, once there is a first one."""
 
     def step(
-        self, window: Window, stamp_ns: int, frame: FeatureFrame, still: bool, report: StepReport
+        self,
+        window: Window,
+        stamp_ns: int,
+        frame: FeatureFrame,
+        still_sigma: float | None,
+        report: StepReport,
     ) -> NavState:
         """Take the measurements of one frame.
 
@@ -155,7 +160,8 @@ class Engine(Protocol):
             window: the variables; the step changes it.
             stamp_ns: time of the frame on the clock of the IMU, after that of the window.
             frame: the observations, all cameras of the rig, finite.
-            still: whether the platform has not moved.
+            still_sigma: standard deviation of the velocity from zero at a standstill, m/s; None if
+                the platform moves.
             report: gets what is known of this step.
 
         Returns:

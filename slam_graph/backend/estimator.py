@@ -265,18 +265,18 @@ class Estimator(EstimatorKnowledge):
         frame, bad = frame.usable(len(self.rig.cameras))
         if bad:
             self.diagnostics.warn("feature_not_finite", f"{bad} of them at {frame.stamp_ns} ns")
-        dynamic = self._standstill.dynamic
-        found = self._check.add(frame, imu, self.window is not None, dynamic)
+        found = self._check.add(frame, imu, self.window is not None, self._standstill.dynamic)
         if isinstance(found, FoundCalibration):
             return self._begin_anew(found)
         self.clock_change = found or self.clock_change
         self._context.propagation.noise.watch_vibration(imu, stamp_ns)
-        still, whole = self._standstill.is_still(imu, stamp_ns, frame), frame
-        frame = frame.without(self._standstill.dynamic)
+        self._standstill.is_still(imu, stamp_ns, frame)
+        still_sigma = self._standstill.velocity_sigma
+        whole, frame = frame, frame.without(self._standstill.dynamic)
         if self.window is None:
             self.window = self._try_to_start(stamp_ns, frame)
         elif stamp_ns > self.window.stamp_ns:
-            stepped = self._engine.step(self.window, stamp_ns, frame, still, self.report)
+            stepped = self._engine.step(self.window, stamp_ns, frame, still_sigma, self.report)
             return self._reviewed(stamp_ns, whole, self._dynamics.reported(stepped))
         elif stamp_ns == self.window.stamp_ns:
             self._context.add_observations(self.window, frame)

@@ -44,6 +44,11 @@ class CostPolicy(Settings):
     max_past_poses: int = Field(11, ge=1)
     """N_max: how many past poses at most (of `keyframes`: how many keyframes). More poses mean less
     drift, and time that grows faster than their number."""
+    pose_spacing_s: float | None = expert(None, ge=0)
+    """A pose that is closer in time to the one before it does not stay, so that the window of a
+    fast camera is not too short, and its features are seen with parallax. 0 keeps all. Not given:
+    0.045 with one camera and an IMU (of 20 Hz all poses stay, of 30 Hz every second one, of 60 Hz
+    every third), else 0. Not for keyframes."""
     recent_frames: int = Field(1, ge=1)
     """How many of the last frames keep their velocity and bias; 1 is the current one only. The IMU
     factors between them are linearised anew in every step. Raise it with `keyframes`, which need
@@ -117,6 +122,8 @@ class CostPolicy(Settings):
                 ("max_features_per_step",),
                 f"features: {self.features} uses no features outside the state",
             )
+        if self.past_poses == "keyframes":
+            self._refuse(("pose_spacing_s",), "past_poses: keyframes keeps no poses by their time")
         if self.past_poses in ("most_recent", "evenly_spaced"):
             self._refuse(
                 ("keyframe_overlap", "keyframe_parallax_rad"),

@@ -39,6 +39,7 @@ class Window:
         prior: what the steps so far have left behind about the variables.
         tracks: observations that have not been used yet.
         past: indices of the past frames whose poses are in the state, ascending.
+        past_stamps_ns: their times on the clock of the IMU, by index.
         moving: those of the past frames whose velocity and bias are in the state too, ascending.
         keyframes: those of the past frames that are keyframes.
         factors: GTSAM's factors that are not part of the prior yet.
@@ -56,6 +57,7 @@ class Window:
     prior: SquareRootInformation
     tracks: FeatureTracks = field(default_factory=FeatureTracks)
     past: list[int] = field(default_factory=list)
+    past_stamps_ns: dict[int, int] = field(default_factory=dict)
     moving: list[int] = field(default_factory=list)
     keyframes: set[int] = field(default_factory=set)
     factors: list[gtsam.NonlinearFactor] = field(default_factory=list)

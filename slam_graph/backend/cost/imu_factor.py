@@ -162,7 +162,7 @@ class Propagation:
         window: Window,
         imu: ImuBuffer,
         stamp_ns: int,
-        still: bool,
+        still_sigma: float | None,
         corrected: Callable[[NavState, NavState], NavState] | None = None,
     ) -> None:
         """Make a new frame the current one.
@@ -172,7 +172,8 @@ class Propagation:
                 frame before.
             imu: samples up to the frame.
             stamp_ns: time of the frame on the clock of the IMU.
-            still: whether the platform has not moved.
+            still_sigma: standard deviation of the velocity from zero at a standstill, m/s; None if
+                the platform moves.
             corrected: gives the state at which the new frame is linearised, from the last state and
                 the predicted one, where this is a guess or samples are missing. An estimate would
                 not find its way from there: the motion may be far from it.
@@ -192,14 +193,15 @@ class Propagation:
             first = self.aiding.by_odometry(previous, predicted) or first
         window.state.insert_imu_state(j, first)
         window.past.append(i)
+        window.past_stamps_ns[i] = window.stamp_ns
         window.moving.append(i)
         window.frame, window.stamp_ns = j, stamp_ns
         factor = imu_factor(i, j, pim)
         window.factors.append(factor)
         self._predict_covariance(predicted, factor, window)
-        self._still = still
-        if still:
-            window.factors += zero_velocity_factors(i, j)
+        self._still = still_sigma is not None
+        if still_sigma is not None:
+            window.factors += zero_velocity_factors(i, j, still_sigma)
         if self.aiding is not None and self.aiding.used:
             self._append_aiding(self.aiding, window, (i, j), (previous.stamp_ns, stamp_ns))
 

@@ -46,6 +46,10 @@ class PoseSelection:
     keyframes: frozenset[int] = frozenset()
 
 
+_POSE_SPACING_S = 0.045
+"""Least time between the poses of one camera with an IMU. A camera of 20 Hz keeps all, also where
+its frames jitter by some milliseconds."""
+
 PoseSelector = Callable[["Window", "CostPolicy", "RigProjection"], PoseSelection]
 """Selects among `window.past`, with the current frame's observations in `window.tracks`; it must
 not change the window."""
@@ -56,8 +60,9 @@ POSE_SELECTIONS: Registry[PoseSelector] = Registry("slam_graph.pose_selections",
 
 @POSE_SELECTIONS.register("most_recent")
 def most_recent(window: Window, policy: CostPolicy, rig: RigProjection) -> PoseSelection:
-    """The latest poses. When the oldest leaves, the features that it saw are used."""
-    return PoseSelection(window.past[-policy.max_past_poses :])
+    """The latest poses that are far enough apart. When the oldest leaves, what it saw is used."""
+    frames = _apart(window, policy, rig)
+    return PoseSelection(frames[-policy.max_past_poses :], _others(window, frames))
 
 
 @POSE_SELECTIONS.register("evenly_spaced")
@@ -68,11 +73,34 @@ def evenly_spaced(window: Window, policy: CostPolicy, rig: RigProjection) -> Pos
     III-E), so that some poses of the far past stay beside the recent ones. The observations of the
     poses that leave are dropped; the features that they saw go on with their other observations.
     """
-    frames = window.past
-    if len(frames) <= policy.max_past_poses:
-        return PoseSelection(list(frames))
-    leaving = frozenset(frames[1 : -policy.recent_frames : 3])
-    return PoseSelection([frame for frame in frames if frame not in leaving], leaving)
+    frames = _apart(window, policy, rig)
+    if len(frames) > policy.max_past_poses:
+        del frames[1 : -policy.recent_frames : 3]
+    return PoseSelection(frames, _others(window, frames))
+
+
+def _apart(window: Window, policy: CostPolicy, rig: RigProjection) -> list[int]:
+    """The past frames without those that are too close in time to the one before.
+
+    One fast camera would fill the window with one view, and its features would be used, or become
+    variables, with little parallax. Several cameras have parallax at once, and what counts is the
+    number of observations, as without an IMU. Frames whose IMU states are kept stay.
+    """
+    spacing_s = policy.pose_spacing_s
+    if spacing_s is None:
+        spacing_s = _POSE_SPACING_S if rig.has_imu and len(rig.cameras) == 1 else 0.0
+    spacing_ns, stamps_ns = round(spacing_s * 1e9), window.past_stamps_ns
+    count = max(len(window.past) - (policy.recent_frames - 1), 1)
+    apart = window.past[:1]
+    for frame in window.past[1:count]:
+        if stamps_ns[frame] - stamps_ns[apart[-1]] >= spacing_ns:
+            apart.append(frame)
+    return apart + window.past[count:]
+
+
+def _others(window: Window, frames: list[int]) -> frozenset[int]:
+    """The past frames that are not among some."""
+    return frozenset(window.past).difference(frames)
 
 
 @POSE_SELECTIONS.register("keyframes")

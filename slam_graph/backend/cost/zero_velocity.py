@@ -35,7 +35,7 @@ _STATIC_SHARE = 1.0 / 3.0
 """Smallest share of the features that must be static; the others may be on moving objects."""
 
 VELOCITY_SIGMA = 0.01
-"""Standard deviation of the velocity at a standstill, m/s."""
+"""Standard deviation of the velocity at a standstill, m/s, where the IMU shows no motion."""
 POSITION_SIGMA = 1e-3
 """Standard deviation of the motion between two frames at a standstill, m."""
 ROTATION_SIGMA = 1e-3
@@ -50,6 +50,10 @@ _NO_NOISE = 1e-6
 _GAINED_SPEED = 0.02
 """Change of velocity, beyond what the noise of the IMU gives, that ends a standstill, m/s. It sees
 a take-off that noisy images do not see yet."""
+
+_TAKE_OFF_SIGMAS = 10.0
+"""Standard deviation of the velocity, in units of what was gained within that limit. The frames of
+a take-off all err in its direction, and each factor is taken for a measurement of its own."""
 
 _BRIDGE = 2.0
 """Largest value of a Brownian bridge of unit variance: exceeded with a probability of 7e-4."""
@@ -73,6 +77,8 @@ class StandstillDetector:
             not, or that were reported by `add_dynamic`. A feature stays dynamic while it is tracked
             by the first camera.
         noise_px: standard deviation of a coordinate of a feature over the window; 0 if not known.
+        velocity_sigma: how far from zero the velocity may be (standard deviation, m/s) in the last
+            frame; None if that is not at a standstill.
     """
 
     def __init__(
@@ -96,6 +102,7 @@ class StandstillDetector:
         self._recent: deque[tuple[int, FeatureObservations]] = deque()
         self.noise_px = 0.0
         self._noises_px: deque[tuple[int, float]] = deque()
+        self.velocity_sigma: float | None = None
 
     def is_still(self, imu: ImuBuffer, stamp_ns: int, frame: FeatureFrame) -> bool:
         """Whether images and IMU agree that nothing has moved over the window.
@@ -110,12 +117,10 @@ class StandstillDetector:
         while len(self._recent) > 1 and self._recent[1][0] <= start_ns:
             self._recent.popleft()
         self._measure_noise(start_ns)
-        still = (
-            self._enabled
-            and self._recent[0][0] <= start_ns
-            and self._images_are_still()
-            and self._imu_is_still(imu, start_ns, stamp_ns)
-        )
+        self.velocity_sigma = None
+        if self._enabled and self._recent[0][0] <= start_ns and self._images_are_still():
+            self.velocity_sigma = self._sigma_by_imu(imu, start_ns, stamp_ns)
+        still = self.velocity_sigma is not None
         self.dynamic = self.dynamic[is_in(self.dynamic, self._recent[-1][1].ids)]
         if still:
             self._find_dynamic()
@@ -207,16 +212,23 @@ class StandstillDetector:
             disparity_px = np.linalg.norm(motion, axis=1)
             self.dynamic = ascending_union(self.dynamic, ids[disparity_px > limit_px])
 
-    def _imu_is_still(self, imu: ImuBuffer, start_ns: int, stamp_ns: int) -> bool:
-        """Whether rate and specific force are constant but for noise."""
+    def _sigma_by_imu(self, imu: ImuBuffer, start_ns: int, stamp_ns: int) -> float | None:
+        """`velocity_sigma` if rate and specific force are constant but for noise.
+
+        In the first frames of a take-off the change of the force is still within its limit, and
+        the velocity that it gives is not zero.
+        """
         if not imu.covers(start_ns):
-            return False
+            return None
         recent = imu.between(start_ns, stamp_ns)
-        return bool(
-            np.max(np.std(recent.gyro, axis=0)) < self._config.max_gyro_std
-            and np.max(np.std(recent.accel, axis=0)) < self._config.max_accel_std
-            and _gained_speed(recent) < _GAINED_SPEED
-        )
+        if np.max(np.std(recent.gyro, axis=0)) >= self._config.max_gyro_std:
+            return None
+        if np.max(np.std(recent.accel, axis=0)) >= self._config.max_accel_std:
+            return None
+        gained = _gained_speed(recent)
+        if gained >= _GAINED_SPEED:
+            return None
+        return math.hypot(VELOCITY_SIGMA, _TAKE_OFF_SIGMAS * max(gained, 0.0))
 
 
 def _gained_speed(imu: ImuData) -> float:
@@ -263,10 +275,12 @@ def _common_motion_px(
     return ids, after.pixels.take(common, axis=0) - before.pixels.take(there, axis=0)
 
 
-def zero_velocity_factors(i: int, j: int) -> list[gtsam.NonlinearFactor]:
-    """The pose of frame j equals that of frame i, and its velocity is zero."""
+def zero_velocity_factors(
+    i: int, j: int, velocity_sigma: float = VELOCITY_SIGMA
+) -> list[gtsam.NonlinearFactor]:
+    """The pose of frame j equals that of frame i, and its velocity is zero to some m/s."""
     between = gtsam.noiseModel.Diagonal.Sigmas(np.repeat([ROTATION_SIGMA, POSITION_SIGMA], 3))
-    still = gtsam.noiseModel.Isotropic.Sigma(3, VELOCITY_SIGMA)
+    still = gtsam.noiseModel.Isotropic.Sigma(3, velocity_sigma)
     return [
         gtsam.BetweenFactorPose3(X(i), X(j), gtsam.Pose3(), between),
         gtsam.PriorFactorVector(V(j), np.zeros(3), still),

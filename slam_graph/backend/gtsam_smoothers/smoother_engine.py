@@ -93,7 +93,12 @@ class SmootherEngine:
         return WindowGraph(graph, values, values, (None,) * graph.size())
 
     def step(
-        self, window: Window, stamp_ns: int, frame: FeatureFrame, still: bool, report: StepReport
+        self,
+        window: Window,
+        stamp_ns: int,
+        frame: FeatureFrame,
+        still_sigma: float | None,
+        report: StepReport,
     ) -> NavState:
         """Predict the state, and add it to the graph if it is time for one."""
         propagation = self._context.propagation
@@ -102,12 +107,12 @@ class SmootherEngine:
         with report.timed("propagation"):
             ahead = Window(window.frame, window.stamp_ns, window.state.copy(), window.prior)
             corrected = self._context.by_images(frame, lambda: self.landmarks(window))
-            propagation.append_frame(ahead, self._context.imu, stamp_ns, still, corrected)
+            propagation.append_frame(ahead, self._context.imu, stamp_ns, still_sigma, corrected)
             predicted = self._predicted(ahead)
         if stamp_ns - window.stamp_ns < self._policy.spacing_s * 1e9:
             return propagation.reported(predicted)
         with report.timed("cost"):
-            if still:
+            if still_sigma is not None:
                 new = self._pause(window.tracks, ahead, frame)
             else:
                 new = self._observations(window.tracks, ahead, predicted, frame)

@@ -133,6 +133,7 @@ def marginalize_step(
     window.prior = marginalize(posterior, window.state, keep, points, store)
     window.factors, window.state_features = factors, constructed.features
     window.past, window.moving = list(kept), list(constructed.moving)
+    window.past_stamps_ns = {i: window.past_stamps_ns[i] for i in kept}
     window.keyframes = set(constructed.poses.keyframes)
     _keep_points(window, constructed)
     _settle_observations(window, constructed)

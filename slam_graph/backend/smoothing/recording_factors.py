@@ -286,7 +286,7 @@ class RecordingFactors:
             before = samples
             factors.append(imu_factor(k, k + 1, pim))
             if self._segment.still[i + 1 : j + 1].all():
-                factors += zero_velocity_factors(k, k + 1)
+                factors += zero_velocity_factors(k, k + 1, self._segment.still_sigmas[j])
         return factors
 
 

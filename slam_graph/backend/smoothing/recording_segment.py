@@ -53,7 +53,8 @@ class RecordingSegment:
         stamps_ns: (N,) of all frames, on the clock of the IMU.
         keyframes: (K,) numbers of the frames that are keyframes.
         noise: (N, 2) factors on the white noise of gyroscope and accelerometer.
-        still: (N,) whether the platform stands still.
+        still_sigmas: (N,) standard deviations of the velocity from zero at a standstill, m/s; NaN
+            where the platform moves.
         imu: all IMU samples.
         seen: all observations; its frame indices are those of the frames.
         aiding: factors of position fixes and odometry on the keyframes.
@@ -62,10 +63,15 @@ class RecordingSegment:
     stamps_ns: IntArray
     keyframes: IntArray
     noise: FloatArray
-    still: BoolArray
+    still_sigmas: FloatArray
     imu: ImuBuffer
     seen: Observations
     aiding: KeyframeAiding = field(default_factory=KeyframeAiding)
+
+    @property
+    def still(self) -> BoolArray:
+        """(N,) whether the platform stands still."""
+        return np.isfinite(self.still_sigmas)
 
     @property
     def keyframe_stamps_ns(self) -> IntArray:
@@ -95,7 +101,7 @@ def read_segment(
     first, stop = int(keyframes[0]), int(keyframes[-1]) + 1
     offset_ns = round(rig.pose_offset_s * 1e9)
     detector, recent = StandstillDetector(standstill), ImuBuffer()
-    samples, stamps, still = [], [], []
+    samples, stamps, sigmas = [], [], []
     columns: list[tuple[IntArray, ...]] = []
     points: list[FloatArray] = []
     for number, packet in enumerate(log.packets(first, stop, rig)):
@@ -104,7 +110,8 @@ def read_segment(
         samples.append(packet.imu)
         recent.add(packet.imu)
         stamps.append(frame.stamp_ns + offset_ns)
-        still.append(detector.is_still(recent, stamps[-1], frame))
+        detector.is_still(recent, stamps[-1], frame)
+        sigmas.append(np.nan if detector.velocity_sigma is None else detector.velocity_sigma)
         recent.forget_before(stamps[-1] - _RECENT_NS)
         for c, seen in enumerate(frame.cameras):
             columns.append((seen.ids, np.full(len(seen), number), np.full(len(seen), c)))
@@ -116,8 +123,8 @@ def read_segment(
     return RecordingSegment(
         np.array(stamps),
         keyframes - first,
-        _smoothed_noise(log.noise[first:stop], np.array(still)),
-        np.array(still),
+        _smoothed_noise(log.noise[first:stop], np.isfinite(sigmas)),
+        np.array(sigmas),
         imu,
         _table(ids, frames, cameras, _recalibrated(places, cameras, log, rig), len(stamps)),
     )
