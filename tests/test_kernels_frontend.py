@@ -21,7 +21,6 @@ from slam_graph.kernels.halvings import halved, halvings_room
 from slam_graph.kernels.near_pairs import near_pairs, near_pairs_numpy, nearest, nearest_numpy
 from slam_graph.kernels.patch_alignment import align_patches, align_patches_numpy
 from slam_graph.kernels.patch_templates import fill_templates, fill_templates_numpy
-from slam_graph.kernels.smoothed_halving import halve, halve_numpy
 from slam_graph.kernels.spacing import (
     apart,
     apart_numpy,
@@ -55,20 +54,6 @@ def test_corner_scores_are_those_of_opencv(flat: bool) -> None:
     expected = cv2.cornerMinEigenVal(image, 7, None, 3)
     tolerance = 1e-5 * float(expected.max())  # OpenCV adds in 32 bits
     np.testing.assert_allclose(smallest_eigenvalues(image), expected, rtol=0, atol=tolerance)
-
-
-@pytest.mark.parametrize(
-    "shape", [(48, 130), (49, 131), (2, 3), (5, 64), (33, 2), (1, 9), (4, 1), (1, 1)]
-)
-@pytest.mark.parametrize("lightest", [256, 2])
-def test_halve(shape: tuple[int, int], lightest: int) -> None:
-    image = np.random.default_rng(9).integers(0, lightest, shape, dtype=np.uint8)
-    if lightest == 2:  # black and white
-        image *= 255
-    results = [np.zeros((-(-shape[0] // 2), -(-shape[1] // 2)), np.uint8) for _ in range(2)]
-    halve(image, results[0])
-    halve_numpy(image, results[1])
-    np.testing.assert_array_equal(*results)
 
 
 def test_ray_depths() -> None:

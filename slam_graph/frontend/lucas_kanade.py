@@ -19,7 +19,6 @@ from slam_graph.frontend.keypoints import Image, Pixels, Tracks, contiguous
 from slam_graph.frontend.prediction import Prediction, neighbour_flow
 from slam_graph.frontend.reference_patches import ReferencePatches
 from slam_graph.kernels.halvings import halved, halvings_room
-from slam_graph.kernels.smoothed_halving import halve
 from slam_graph.kernels.window_tracking import WINDOW_PX, track_windows
 
 _ITERATIONS = 15
@@ -97,7 +96,7 @@ class _Pyramid:
         larger = halved(self.image, self.halvings, self._made)
         for level in range(self._made + 1, levels + 1):
             smaller = halved(self.image, self.halvings, level)
-            halve(larger, smaller)
+            cv2.pyrDown(larger, smaller)
             larger = smaller
         self._made = levels
 
