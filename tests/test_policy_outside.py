@@ -13,7 +13,7 @@ from pydantic import ValidationError
 from slam_graph.arrays import BoolArray
 from slam_graph.backend import FEATURE_POLICIES, POSE_SELECTIONS, FeaturePolicy, PoseSelection
 from slam_graph.backend.cost.reprojection import RigProjection
-from slam_graph.backend.cost.selection_policies import WaitingTracks, most_recent
+from slam_graph.backend.cost.selection_policies import WaitingTracks, evenly_spaced, most_recent
 from slam_graph.backend.policies import CostPolicy
 from slam_graph.backend.solve.square_root import SquareRootInformation
 from slam_graph.backend.solve.state import State
@@ -87,6 +87,7 @@ def test_how_long_a_track_is_under_poses_from_outside_is_not_known() -> None:
     [
         (None, 1, True, 60, 3),
         (None, 1, True, 30, 2),
+        (None, 1, True, 25, 1),
         (None, 1, True, 20, 1),
         (None, 2, True, 60, 1),
         (None, 1, False, 60, 1),
@@ -112,10 +113,34 @@ def test_poses_of_one_fast_camera_are_kept_apart_in_time(
         assert recent_frames == 1 or frame in selected.kept
         assert dropped.issubset(window.past)
         assert not dropped.intersection(selected.kept)
+        assert window.past[0] not in dropped, "what the oldest pose saw is used"
         window.past = selected.kept
     older = selected.kept[: len(selected.kept) - (recent_frames - 1)]
     assert np.diff(older).tolist() == [every] * (len(older) - 1)
     assert len(selected.kept) == policy.max_past_poses
+
+
+@pytest.mark.parametrize(("rate_hz", "apart_ns"), [(60, 50_000_000), (20, 50_000_000)])
+def test_poses_that_are_thinned_are_apart_in_time_too(rate_hz: int, apart_ns: int) -> None:
+    policy, projection = CostPolicy(max_past_poses=6), RigProjection(rig(1))
+    window = Window(0, 0, State(), SquareRootInformation.empty())
+    for frame in range(40):
+        window.past.append(frame)
+        window.past_stamps_ns[frame] = round(frame * 1e9 / rate_hz)
+        window.past = evenly_spaced(window, policy, projection).kept
+    gaps = np.diff([window.past_stamps_ns[i] for i in window.past])
+    assert np.min(gaps) >= apart_ns - 2
+    assert np.max(gaps) > 2 * apart_ns
+    assert window.past[0] == 0
+
+
+def test_jitter_of_some_milliseconds_costs_no_pose() -> None:
+    policy, projection = CostPolicy(max_past_poses=30), RigProjection(rig(1))
+    window, rng = Window(0, 0, State(), SquareRootInformation.empty()), np.random.default_rng(0)
+    for frame in range(30):
+        window.past.append(frame)
+        window.past_stamps_ns[frame] = round(frame * 5e7 + rng.uniform(-6e6, 6e6))
+    assert most_recent(window, policy, projection).kept == window.past
 
 
 def test_the_spacing_of_poses_is_refused_where_it_has_no_effect() -> None:

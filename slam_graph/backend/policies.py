@@ -45,10 +45,10 @@ class CostPolicy(Settings):
     """N_max: how many past poses at most (of `keyframes`: how many keyframes). More poses mean less
     drift, and time that grows faster than their number."""
     pose_spacing_s: float | None = expert(None, ge=0)
-    """A pose that is closer in time to the one before it does not stay, so that the window of a
-    fast camera is not too short, and its features are seen with parallax. 0 keeps all. Not given:
-    0.045 with one camera and an IMU (of 20 Hz all poses stay, of 30 Hz every second one, of 60 Hz
-    every third), else 0. Not for keyframes."""
+    """Least time between two poses that stay, s, so that the window of a fast camera is not too
+    short, and its features are seen with parallax. Only the frames that stay count for
+    state_feature_frames. 0 keeps all. Not given: 0.037 with one camera and an IMU (of 25 Hz all
+    poses stay, of 30 Hz every second one, of 60 Hz every third), else 0. Not for keyframes."""
     recent_frames: int = Field(1, ge=1)
     """How many of the last frames keep their velocity and bias; 1 is the current one only. The IMU
     factors between them are linearised anew in every step. Raise it with `keyframes`, which need

@@ -14,7 +14,13 @@ from numpy.typing import NDArray
 from slam_graph.arrays import IntArray
 from slam_graph.kernels.compilation import compiled
 
-__all__ = ["WINDOW_PX", "smallest_eigenvalues", "strongest_in_cells", "strongest_maxima"]
+__all__ = [
+    "LARGEST_GRADIENT",
+    "WINDOW_PX",
+    "smallest_eigenvalues",
+    "strongest_in_cells",
+    "strongest_maxima",
+]
 
 WINDOW_PX = 7
 """Side of the window over which the products of gradients are summed. As a constant the sums are
@@ -36,7 +42,7 @@ _Pixels = NDArray[np.float32]
 
 _NO, _YES = np.uint8(0), np.uint8(1)
 _HALF, _TWO = np.float32(0.5), np.int16(2)
-_LARGEST = 4 * 255
+LARGEST_GRADIENT = 4 * 255
 """Of a gradient by Sobel's filter of 3 x 3 pixels."""
 
 
@@ -128,7 +134,7 @@ def _fill_scores(image: _Image, left: int, top: int, scores: _Scores) -> None:
     xx, xy, yy = np.zeros(length, np.int32), np.zeros(length, np.int32), np.zeros(length, np.int32)
     own_xx, own_xy = xx[_RADIUS : _RADIUS + width], xy[_RADIUS : _RADIUS + width]
     own_yy = yy[_RADIUS : _RADIUS + width]
-    unit = 1.0 / (_LARGEST * WINDOW_PX)
+    unit = 1.0 / (LARGEST_GRADIENT * WINDOW_PX)
     scale = np.float32(unit * unit)
     for row in range(-_RADIUS, height + _RADIUS):
         first = row - WINDOW_PX + 1  # of the window whose last one this is
@@ -165,7 +171,7 @@ def smallest_eigenvalues(image: _Image) -> _Scores:
 
 
 @compiled()
-def _largest(scores: NDArray[np.int32], allowed: _Flags) -> np.int32:
+def _largest_allowed(scores: NDArray[np.int32], allowed: _Flags) -> np.int32:
     """The largest number that is allowed, at least 0."""
     largest = np.int32(0)
     for u in range(len(scores)):
@@ -223,7 +229,7 @@ def strongest_maxima(
     # Numbers above 0 are in the order of their bits, of which the largest is found by vectors
     bits, largest = scores.view(np.int32), np.zeros(1, np.int32)
     for v in range(height):
-        largest[0] = max(largest[0], _largest(bits[v], allowed[v]))
+        largest[0] = max(largest[0], _largest_allowed(bits[v], allowed[v]))
     limit = np.float32(float(largest.view(np.float32)[0]) * share)
     found = np.empty((height * width, 3), np.float32)
     n = 0

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam_graph.arrays import FloatArray, IntArray
-from slam_graph.kernels.corners import _HALF, _LARGEST, WINDOW_PX
+from slam_graph.kernels.corners import LARGEST_GRADIENT, WINDOW_PX
 from slam_graph.kernels.spacing import clear_disks_numpy
 
 __all__ = ["smallest_eigenvalues_numpy", "strongest_in_cells_numpy", "strongest_maxima_numpy"]
@@ -29,8 +29,8 @@ def smallest_eigenvalues_numpy(image: _Image) -> _Scores:
         cv2.boxFilter(product, cv2.CV_64F, side, normalize=False).astype(np.float32)
         for product in (x * x, x * y, y * y)
     )
-    scale = np.float32((1.0 / (_LARGEST * WINDOW_PX)) ** 2)
-    a, b, c = xx * scale * _HALF, xy * scale, yy * scale * _HALF
+    scale, half = np.float32((1.0 / (LARGEST_GRADIENT * WINDOW_PX)) ** 2), np.float32(0.5)
+    a, b, c = xx * scale * half, xy * scale, yy * scale * half
     return np.asarray((a + c) - np.sqrt((a - c) * (a - c) + b * b), np.float32)
 
 

@@ -91,9 +91,9 @@ def _outside(u: int, v: int, image: _Image) -> bool:
 @compiled()
 def _reflected(place: int, length: int) -> int:
     """Where a line is continued beyond its ends, as by OpenCV's BORDER_REFLECT_101."""
-    while not 0 <= place < length:
+    while length > 1 and not 0 <= place < length:
         place = -place if place < 0 else 2 * length - 2 - place
-    return place
+    return place if length > 1 else 0
 
 
 @compiled()

@@ -46,9 +46,9 @@ class PoseSelection:
     keyframes: frozenset[int] = frozenset()
 
 
-_POSE_SPACING_S = 0.045
-"""Least time between the poses of one camera with an IMU. A camera of 20 Hz keeps all, also where
-its frames jitter by some milliseconds."""
+_POSE_SPACING_S = 0.037
+"""Least time between the poses of one camera with an IMU. A camera of 20 or 25 Hz keeps all, also
+where its frames jitter by some milliseconds."""
 
 PoseSelector = Callable[["Window", "CostPolicy", "RigProjection"], PoseSelection]
 """Selects among `window.past`, with the current frame's observations in `window.tracks`; it must

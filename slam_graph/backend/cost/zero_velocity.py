@@ -52,8 +52,9 @@ _GAINED_SPEED = 0.02
 a take-off that noisy images do not see yet."""
 
 _TAKE_OFF_SIGMAS = 10.0
-"""Standard deviation of the velocity, in units of what was gained within that limit. The frames of
-a take-off all err in its direction, and each factor is taken for a measurement of its own."""
+"""Standard deviation of the velocity at a standstill, in units of the speed that was gained within
+that limit. In a take-off the velocity of all frames has the direction of the gained speed, while
+each factor is taken for a measurement of its own."""
 
 _BRIDGE = 2.0
 """Largest value of a Brownian bridge of unit variance: exceeded with a probability of 7e-4."""
@@ -275,9 +276,7 @@ def _common_motion_px(
     return ids, after.pixels.take(common, axis=0) - before.pixels.take(there, axis=0)
 
 
-def zero_velocity_factors(
-    i: int, j: int, velocity_sigma: float = VELOCITY_SIGMA
-) -> list[gtsam.NonlinearFactor]:
+def zero_velocity_factors(i: int, j: int, velocity_sigma: float) -> list[gtsam.NonlinearFactor]:
     """The pose of frame j equals that of frame i, and its velocity is zero to some m/s."""
     between = gtsam.noiseModel.Diagonal.Sigmas(np.repeat([ROTATION_SIGMA, POSITION_SIGMA], 3))
     still = gtsam.noiseModel.Isotropic.Sigma(3, velocity_sigma)

@@ -23,7 +23,8 @@ from slam_graph.backend.solve.square_root import Layout
 class BatchCost(Cost):
     """The cost of a window whose features outside the state follow the poses."""
 
-    _moved: FloatArray | None = None  # squared residuals (N,) where a step has led
+    # squared residuals (N,) of some observations at some points, where a step has led
+    _moved: tuple[Observations, FloatArray, FloatArray] | None = None
     _known_rows: tuple[tuple[object, ...], FloatArray] | None = None  # of GTSAM's factors
 
     def apply(self, delta: FloatArray, linear: Linearization, layout: Layout) -> None:
@@ -37,13 +38,13 @@ class BatchCost(Cost):
         better = found.good & (ours < theirs)
         points = np.where(better[:, None], found.points, tracks.points)
         self.tracks = replace(tracks, points=points)
-        self._moved = np.where(better[obs.feature], *squares)
+        self._moved = obs, points, np.where(better[obs.feature], *squares)
 
     def _loss(self, obs: Observations, points: FloatArray | None) -> float:
         known, self._moved = self._moved, None
-        if known is None:
+        if known is None or known[0] is not obs or known[1] is not points:
             return super()._loss(obs, points)
-        return float(np.sum(self.robust.value(np.sqrt(known))))
+        return float(np.sum(self.robust.value(np.sqrt(known[2]))))
 
     def triangulated(self, obs: Observations) -> Triangulation:
         """Features from the current estimates of the poses."""

@@ -10,7 +10,6 @@ refused if it does not fit, or does not determine velocity and scale well enough
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import ClassVar
 
 import gtsam
 import numpy as np
@@ -41,7 +40,7 @@ from slam_graph.backend.marginalization.marginalize import (
 )
 from slam_graph.backend.policies import GaussNewtonPolicy
 from slam_graph.backend.solve.damped_steps import Attempt
-from slam_graph.backend.solve.gauss_newton import Hopeful, HopelessError, linearized, minimize
+from slam_graph.backend.solve.gauss_newton import Hopeful, linearized, minimize
 from slam_graph.backend.solve.square_root import Layout, SquareRootInformation
 from slam_graph.backend.solve.state import POINT_DIM, State, dims_of, imu_state_keys
 from slam_graph.backend.window import Window
@@ -90,12 +89,9 @@ class DynamicRefinement:
     """The batch problem of a start in motion.
 
     Attributes:
-        gives_up: whether steps end early where no start is to be expected of them.
         outliers: ids (N,) of the features that did not fit the last solution, ascending.
         scale_sigma: relative standard deviation of the scale of the last solution.
     """
-
-    gives_up: ClassVar[bool] = True
 
     def __init__(self, context: EngineContext, unknown_scale: UnknownScale) -> None:
         """Prepare for attempts.
@@ -123,9 +119,10 @@ class DynamicRefinement:
             hopeless = self._hopeless(cost, linear, len(guess.static))
             if hopeless is not None:
                 return hopeless
-            found = minimize(cost, _BATCH, linear, hopeful=self._hope(cost))
-            if self.gives_up and not found.converged:
-                return _UNSETTLED
+            hopeful = self._hope(cost)
+            found = minimize(cost, _BATCH, linear, hopeful=hopeful)
+            if hopeful is not None and not found.converged:
+                return _unsettled(found.costs[-1], cost)
             self._refine_motions(cost, frames)
             fit, seen = self._remove_outliers(cost, lasting)
             if fit < max(MIN_FEATURES, _MIN_INLIERS * seen):
@@ -138,8 +135,6 @@ class DynamicRefinement:
             self.scale_sigma = _scale_sigma(cost, linear, posterior)
         except np.linalg.LinAlgError:
             return Refusal("motion", "motion that determines gravity and scale")
-        except HopelessError:
-            return _UNSETTLED
         last, calibration = len(frames.frames) - 1, self._context.calibration.keys
         keep = [L(j) for j in features.tolist()]
         keep += [*calibration, *imu_state_keys(last)]
@@ -176,9 +171,8 @@ class DynamicRefinement:
         return None
 
     def _hope(self, cost: BatchCost) -> Hopeful | None:
-        """Whether a start may come of the steps so far."""
-        if not self.gives_up or cost.tracks is None:
-            return None
+        """Whether a start may come of the steps so far; None if all are taken in any case."""
+        assert cost.tracks is not None, "asked for before"
         tried, bar = 0, 0.5 * MAX_NORMALIZED_COST * _dof(cost.tracks)
 
         def hopeful(attempt: Attempt) -> bool:
@@ -333,6 +327,16 @@ def _normalized_cost(cost: Cost, linear: Linearization) -> float:
     if not isinstance(tracks, SummedFeatures) or cost.tracks is None:
         return float("inf")
     return float(np.sum(tracks.rows[:, -1] ** 2)) / _dof(cost.tracks)
+
+
+def _unsettled(value: float, cost: BatchCost) -> Refusal:
+    """What is missing where the steps ended at some cost without having converged."""
+    assert cost.tracks is not None
+    normalized = value / (0.5 * _dof(cost.tracks))
+    if normalized <= MAX_NORMALIZED_COST:
+        return _UNSETTLED
+    needs = f"images and IMU to agree (normalised cost {normalized:.1f})"
+    return Refusal("fit", needs, lasting=True)
 
 
 def _dof(tracks: TrackFeatures) -> int:

@@ -29,11 +29,15 @@ STATIC_DISPARITY_PX = 1.5
 running motors shake the image."""
 RETRY_S = 0.2
 """Time between two attempts to start in motion; each takes as long as many frames."""
-_FREE_RETRIES, _MOST_DOUBLINGS, _LONGEST_RETRY_S = 6, 3, 1.2
-"""The time doubles with each attempt after the sixth whose steps did not converge, up to this. Such
-an attempt is among the costliest, and what is wrong then is no lack of motion: before none of 250
-starts with a right calibration there were more than two in a row, and with focal lengths that are
-10 % too long, where an estimate is still of use, five."""
+_PATIENT_ATTEMPTS = 6
+"""With each attempt after so many whose steps did not converge the time doubles; one that fails for
+another reason takes one of them back. They are among the costliest, and what is wrong then is no
+lack of motion: before none of 250 starts with a right calibration there were more than two in a
+row, and with focal lengths that are 10 % too long, where an estimate is still of use, five."""
+_MOST_DOUBLINGS = 3
+"""More attempts in vain than lead to so many doublings do not count."""
+_LONGEST_RETRY_S = 1.2
+"""Longest time between two attempts."""
 FRAME_SPACING_S = 0.15
 """Time between the frames of a start in motion."""
 _SLACK_NS = 100_000_000
@@ -144,12 +148,12 @@ class Initializer:
         outcome = self._attempt()
         lasting = isinstance(outcome, Refusal) and outcome.lasting
         in_vain = self._in_vain + (1 if lasting else -1)
-        self._in_vain = min(max(in_vain, 0), _FREE_RETRIES + _MOST_DOUBLINGS)
+        self._in_vain = min(max(in_vain, 0), _PATIENT_ATTEMPTS + _MOST_DOUBLINGS)
         return outcome
 
     def _retry_s(self) -> float:
         """Time from the last attempt to the next."""
-        doublings = max(self._in_vain - _FREE_RETRIES, 0)
+        doublings = max(self._in_vain - _PATIENT_ATTEMPTS, 0)
         return min(RETRY_S * 2.0**doublings, _LONGEST_RETRY_S)
 
     def _attempt(self) -> Window | Refusal:

@@ -163,10 +163,11 @@ class MonocularStart:
 class ScaleFreeRefinement(DynamicRefinement):
     """The batch problem of a start without an IMU, whose scale is a convention."""
 
-    gives_up = False
-
     def __init__(self, context: EngineContext) -> None:
         super().__init__(context, "wait")
+
+    def _hope(self, cost: BatchCost) -> None:
+        """All steps are taken: without an IMU attempts that fail are rare."""
 
     def _factors(self, frames: StartFrames, guess: StartGuess) -> list[gtsam.NonlinearFactor]:
         """The dynamics from frame to frame, the first pose, and the distance to the last one."""

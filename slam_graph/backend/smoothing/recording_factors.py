@@ -260,7 +260,7 @@ class RecordingFactors:
     def _still(self, k: int) -> bool:
         """Whether the platform stands still at any time between keyframe k and the next one."""
         i, j = self._segment.keyframes[k : k + 2]
-        return bool(self._segment.still[i : j + 1].any())
+        return bool(np.isfinite(self._segment.still_sigmas[i : j + 1]).any())
 
     def _noise_factors(self, k: int) -> tuple[float, float, float]:
         """Factors on all noise after keyframe k; on white noise of gyroscope; of accelerometer."""
@@ -285,7 +285,7 @@ class RecordingFactors:
             pim = samples.preintegrated(values.atConstantBias(B(k)), params)
             before = samples
             factors.append(imu_factor(k, k + 1, pim))
-            if self._segment.still[i + 1 : j + 1].all():
+            if np.isfinite(self._segment.still_sigmas[i + 1 : j + 1]).all():
                 factors += zero_velocity_factors(k, k + 1, self._segment.still_sigmas[j])
         return factors
 

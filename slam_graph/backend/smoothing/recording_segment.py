@@ -69,11 +69,6 @@ class RecordingSegment:
     aiding: KeyframeAiding = field(default_factory=KeyframeAiding)
 
     @property
-    def still(self) -> BoolArray:
-        """(N,) whether the platform stands still."""
-        return np.isfinite(self.still_sigmas)
-
-    @property
     def keyframe_stamps_ns(self) -> IntArray:
         """(K,) on the clock of the IMU."""
         return self.stamps_ns[self.keyframes]

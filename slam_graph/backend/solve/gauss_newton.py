@@ -41,7 +41,8 @@ class Minimum:
         costs: the cost before the first step and after each step that was taken; of a single step
             that nothing depends on by what it promised, which takes no time.
         repeated: whether there were more steps than the policy has, because one was too large.
-        converged: with damping: whether the steps ended because the cost fell no more.
+        converged: whether the steps ended because the cost fell no more; True without damping,
+            where that is not judged.
     """
 
     posterior: SquareRootInformation
@@ -55,11 +56,7 @@ Again = Callable[[SquareRootInformation, FloatArray], bool]
 
 
 Hopeful = Callable[[Attempt], bool]
-"""Whether it is worth to go on after a step that was tried."""
-
-
-class HopelessError(ArithmeticError):
-    """Steps were given up, as nothing good was to be expected of them."""
+"""Whether it is worth going on after a step that was tried and did not end the minimisation."""
 
 
 def minimize(
@@ -78,11 +75,11 @@ def minimize(
         linear: the linearisation at the current estimates, where it is known already.
         again: asks for more steps than the policy has, up to `_MAX_REPEATED_STEPS` in all.
         predicted: what is known without images at the current estimates, where that is known.
-        hopeful: is asked after each step of Levenberg-Marquardt.
+        hopeful: is asked after each step of Levenberg-Marquardt; where it says no, the steps end
+            without having converged.
 
     Raises:
         numpy.linalg.LinAlgError: if the cost leaves a variable undetermined.
-        HopelessError: if `hopeful` says that it is not worth to go on.
     """
     if policy.damping == "levenberg_marquardt":
         return _levenberg_marquardt(cost, policy, linear, predicted, hopeful)
@@ -171,20 +168,24 @@ def _levenberg_marquardt(
     hopeful: Hopeful | None,
 ) -> Minimum:
     """Gauss-Newton steps, with damping from the first one on that does not lower the cost."""
-    problem = _DampedCost(cost, linear, predicted)
+    problem, given_up = _DampedCost(cost, linear, predicted), False
 
     def converged(attempt: Attempt) -> bool:
-        if hopeful is not None and not hopeful(attempt):
-            raise HopelessError
         if not attempt.accepted:
             return attempt.predicted < policy.tolerance * attempt.before
         gain = attempt.before - attempt.after
         undamped = 0.0 if attempt.damping else attempt.predicted
         return max(gain, undamped) < policy.tolerance * attempt.after
 
+    def ended(attempt: Attempt) -> bool:
+        nonlocal given_up
+        done = converged(attempt)
+        given_up = not (done or hopeful is None or hopeful(attempt))
+        return done or given_up
+
     damping = TenfoldDamping(_INITIAL_DAMPING, _MAX_DAMPING)
-    steps = levenberg_marquardt(problem, policy.max_steps, converged, damping)
-    return Minimum(problem.posterior(), steps.costs, converged=steps.converged)
+    steps = levenberg_marquardt(problem, policy.max_steps, ended, damping)
+    return Minimum(problem.posterior(), steps.costs, converged=steps.converged and not given_up)
 
 
 class _DampedCost:
