@@ -56,7 +56,8 @@ def decisions(
         pixels = home + drift_px(t_s) + rng.normal(0.0, noise_px, home.shape)
         seen = FeatureObservations(np.arange(features), pixels, pixels / 400.0)
         stamp_ns = round(t_s * 1e9)
-        said.append(detector.is_still(imu, stamp_ns, FeatureFrame(stamp_ns, (seen,))))
+        sigma = detector.add_frame(imu, stamp_ns, FeatureFrame(stamp_ns, (seen,)))
+        said.append(sigma is not None)
     return said, detector
 
 
@@ -133,7 +134,8 @@ def test_without_imu_there_is_no_evidence() -> None:
     seen = FeatureObservations(np.arange(20), np.ones((20, 2)), np.ones((20, 2)))
     detector = StandstillDetector(CONFIG)
     stamps = [round(t_s * 1e9) for t_s in np.arange(0.0, 2.0, 0.1).tolist()]
-    assert not any(detector.is_still(ImuBuffer(), t, FeatureFrame(t, (seen,))) for t in stamps)
+    said = [detector.add_frame(ImuBuffer(), t, FeatureFrame(t, (seen,))) for t in stamps]
+    assert said == [None] * len(stamps)
 
 
 @pytest.mark.parametrize(("accel_mps2", "since_s"), [(0.0, 0.0), (0.2, 0.08), (0.1, 0.15)])
@@ -152,9 +154,9 @@ def test_a_velocity_that_the_imu_has_gained_is_not_taken_for_zero(
         pixels = home + rng.normal(0.0, 0.5, home.shape)
         seen = FeatureObservations(np.arange(40), pixels, pixels / 400.0)
         stamp_ns = round(stamp_s * 1e9)
-        still = detector.is_still(imu, stamp_ns, FeatureFrame(stamp_ns, (seen,)))
-        assert still == (detector.velocity_sigma is not None)
-    sigma, gained = detector.velocity_sigma, accel_mps2 * since_s
+        sigma = detector.add_frame(imu, stamp_ns, FeatureFrame(stamp_ns, (seen,)))
+        assert (sigma is not None) == (detector.since_ns is not None)
+    gained = accel_mps2 * since_s
     assert sigma is not None
     assert (sigma > VELOCITY_SIGMA) == (gained > 0.0)
     assert gained < 1.2 * sigma

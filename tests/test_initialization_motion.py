@@ -111,6 +111,15 @@ def test_the_imu_tells_the_static_world_from_an_object(cameras: int, dynamic: in
     assert np.mean(static[~true]) < 0.05
 
 
+@pytest.mark.parametrize("count", [3, 4, 7])
+def test_samples_have_different_features_all_equally_likely(count: int) -> None:
+    rng, size = np.random.default_rng(0), min(4, count)
+    samples = np.concatenate([random_samples(count, rng) for _ in range(20)])
+    assert np.all(samples.sum(axis=1) == size)
+    spread = np.sqrt(size / count * (1.0 - size / count) / len(samples))
+    assert np.all(np.abs(samples.mean(axis=0) - size / count) <= 4.0 * spread)
+
+
 @pytest.mark.parametrize("count", [3, 4, 5, 40, 150])
 def test_samples_are_those_that_numpy_chooses_one_by_one(count: int) -> None:
     ours, theirs = (np.random.default_rng(count) for _ in range(2))

@@ -270,8 +270,7 @@ class Estimator(EstimatorKnowledge):
             return self._begin_anew(found)
         self.clock_change = found or self.clock_change
         self._context.propagation.noise.watch_vibration(imu, stamp_ns)
-        self._standstill.is_still(imu, stamp_ns, frame)
-        still_sigma = self._standstill.velocity_sigma
+        still_sigma = self._standstill.add_frame(imu, stamp_ns, frame)
         whole, frame = frame, frame.without(self._standstill.dynamic)
         if self.window is None:
             self.window = self._try_to_start(stamp_ns, frame)

@@ -9,7 +9,7 @@ features. The others build a pyramid and need the whole image.
 from __future__ import annotations
 
 import importlib
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import cv2
 import numpy as np
@@ -70,6 +70,42 @@ class Detector(Protocol):
         ...
 
 
+@runtime_checkable
+class CellDetector(Protocol):
+    """A detector that takes all cells of an image in one call, which saves time."""
+
+    def detect_in_cells(
+        self,
+        image: Image,
+        free: Image,
+        cells: IntArray,
+        margin_px: int,
+        wanted: IntArray,
+        missing: int,
+        surplus: int,
+        distance_px: float,
+        half_widths: IntArray,
+    ) -> tuple[Pixels, IntArray, IntArray]:
+        """The strongest keypoints of one cell after the other, until there are enough.
+
+        Args:
+            image: (height, width).
+            free: of the same size, zero where none are wanted; it is changed.
+            cells: (C, 4) first column, first row, and the column and row behind the last ones.
+            margin_px: pixels around a cell that a score in it depends on.
+            wanted: (C,) how many each cell is to have at most.
+            missing: how many are wanted in all.
+            surplus: factor on both, for callers that will reject some.
+            distance_px: least distance of two keypoints.
+            half_widths: (2 r + 1,) of the rows of a disk, in which others are not wanted.
+
+        Returns:
+            Pixels (N, 2), cell by cell; of each of the V cells that were visited, how many were
+            found (V,), and how many were wanted there (V,), without the surplus.
+        """
+        ...
+
+
 def require(module: str, purpose: str) -> Any:
     """Import a module of an optional library.
 
@@ -116,7 +152,7 @@ class _GradientCorners:
 
 
 @DETECTORS.register("shi_tomasi")
-class ShiTomasiCorners(_GradientCorners):
+class _ShiTomasiCorners(_GradientCorners):
     """Corners by their smaller eigenvalue, in all cells of an image at once."""
 
     def __init__(self, config: FrontendConfig) -> None:
@@ -135,7 +171,7 @@ class ShiTomasiCorners(_GradientCorners):
         distance_px: float,
         half_widths: IntArray,
     ) -> tuple[Pixels, IntArray, IntArray]:
-        """The strongest corners of each cell, which are far apart; see `strongest_in_cells`."""
+        """The strongest corners of each cell, which are far apart; see `CellDetector`."""
         size = int(np.prod(cells[:, 2:] - cells[:, :2] + 2 * margin_px, axis=1).max(initial=0))
         if size > len(self._room):
             self._room = np.empty(size, np.float32)

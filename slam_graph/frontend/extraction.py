@@ -13,7 +13,7 @@ import numpy as np
 
 from slam_graph.arrays import BoolArray, IntArray
 from slam_graph.errors import ConfigError
-from slam_graph.frontend.detectors import ShiTomasiCorners, refine
+from slam_graph.frontend.detectors import CellDetector, refine
 from slam_graph.frontend.frontend_config import DETECTORS, FrontendConfig
 from slam_graph.frontend.keypoints import Image, Keypoints, Pixels, spread
 from slam_graph.image_files import ImageFile
@@ -115,6 +115,7 @@ class FeatureExtractor:
         self._config = config
         self._distance_px = config.min_distance_px if distance_px is None else distance_px
         self._detector = DETECTORS[config.detector_name](config)
+        self._by_cells = self._detector if isinstance(self._detector, CellDetector) else None
         columns, rows = config.grid
         xs = np.linspace(0, width, columns + 1).astype(int)
         ys = np.linspace(0, height, rows + 1).astype(int)
@@ -156,8 +157,8 @@ class FeatureExtractor:
             surplus: factor on the number of points, for callers that will reject some.
         """
         cells, shares = self._wanted(occupied)
-        if isinstance(self._detector, ShiTomasiCorners):
-            pixels, counts, quotas = self._detector.detect_in_cells(
+        if self._by_cells is not None:
+            pixels, counts, quotas = self._by_cells.detect_in_cells(
                 image,
                 self._free(occupied),
                 self._bounds.take(cells, axis=0),
@@ -179,7 +180,7 @@ class FeatureExtractor:
     def _one_by_one(
         self, image: Image, occupied: Pixels, cells: IntArray, shares: IntArray, surplus: int
     ) -> tuple[Pixels, IntArray, IntArray]:
-        """`ShiTomasiCorners.detect_in_cells` for other detectors."""
+        """`CellDetector.detect_in_cells` for other detectors."""
         free, missing = self._free(occupied), self._missing(occupied)
         found, quotas = [np.zeros((0, 2), np.float32)], []
         whole: Keypoints | None = None

@@ -78,8 +78,6 @@ class StandstillDetector:
             not, or that were reported by `add_dynamic`. A feature stays dynamic while it is tracked
             by the first camera.
         noise_px: standard deviation of a coordinate of a feature over the window; 0 if not known.
-        velocity_sigma: how far from zero the velocity may be (standard deviation, m/s) in the last
-            frame; None if that is not at a standstill.
     """
 
     def __init__(
@@ -103,25 +101,28 @@ class StandstillDetector:
         self._recent: deque[tuple[int, FeatureObservations]] = deque()
         self.noise_px = 0.0
         self._noises_px: deque[tuple[int, float]] = deque()
-        self.velocity_sigma: float | None = None
 
-    def is_still(self, imu: ImuBuffer, stamp_ns: int, frame: FeatureFrame) -> bool:
-        """Whether images and IMU agree that nothing has moved over the window.
+    def add_frame(self, imu: ImuBuffer, stamp_ns: int, frame: FeatureFrame) -> float | None:
+        """Decide whether images and IMU agree that nothing has moved over the window.
 
         Args:
             imu: samples up to the frame.
             stamp_ns: time of the frame on the clock of the IMU.
             frame: compared by the features of its first camera.
+
+        Returns:
+            How far from zero the velocity may be now, as a standard deviation in m/s; None if the
+            platform moves.
         """
         start_ns = stamp_ns - round(self._config.window_s * 1e9)
         self._recent.append((stamp_ns, _by_id(frame.cameras[0])))
         while len(self._recent) > 1 and self._recent[1][0] <= start_ns:
             self._recent.popleft()
         self._measure_noise(start_ns)
-        self.velocity_sigma = None
+        velocity_sigma = None
         if self._enabled and self._recent[0][0] <= start_ns and self._images_are_still():
-            self.velocity_sigma = self._sigma_by_imu(imu, start_ns, stamp_ns)
-        still = self.velocity_sigma is not None
+            velocity_sigma = self._sigma_by_imu(imu, start_ns, stamp_ns)
+        still = velocity_sigma is not None
         self.dynamic = self.dynamic[is_in(self.dynamic, self._recent[-1][1].ids)]
         if still:
             self._find_dynamic()
@@ -129,7 +130,7 @@ class StandstillDetector:
             self.since_ns = None
         elif self.since_ns is None:
             self.since_ns = self._recent[0][0]
-        return still
+        return velocity_sigma
 
     def add_dynamic(self, ids: IntArray) -> None:
         """Add features (N,) that were found to be dynamic in another way."""
@@ -214,7 +215,7 @@ class StandstillDetector:
             self.dynamic = ascending_union(self.dynamic, ids[disparity_px > limit_px])
 
     def _sigma_by_imu(self, imu: ImuBuffer, start_ns: int, stamp_ns: int) -> float | None:
-        """`velocity_sigma` if rate and specific force are constant but for noise.
+        """Standard deviation of the velocity, m/s, if rate and force are constant but for noise.
 
         In the first frames of a take-off the change of the force is still within its limit, and
         the velocity that it gives is not zero.

@@ -98,7 +98,7 @@ class Initializer:
         outcome: Window | Refusal = Refusal("frames", "a state to start from (mode 'given')")
         self._latest = stamp_ns, frame
         if self._mode in ("auto", "static"):
-            self._standstill.is_still(self._context.imu, stamp_ns, frame)
+            self._standstill.add_frame(self._context.imu, stamp_ns, frame)
             outcome = self._at_rest(stamp_ns)
         if self._mode in ("auto", "motion") and isinstance(outcome, Refusal):
             outcome = self._in_motion(stamp_ns, frame)

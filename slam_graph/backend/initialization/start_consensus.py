@@ -122,8 +122,8 @@ def random_samples(count: int, rng: np.random.Generator) -> FloatArray:
 
     Floyd's algorithm for all samples at once: of the numbers from 0 to j the one that is drawn, or
     j if the sample has that one. The draws are those of `rng.choice` for one sample after the
-    other, those by which it shuffles included, and so are the samples; it takes fifty times as
-    long.
+    other, those by which it shuffles included, and so are the samples; `rng.choice` takes fifty
+    times as long.
 
     Args:
         count: number of features, J.

@@ -105,8 +105,8 @@ def read_segment(
         samples.append(packet.imu)
         recent.add(packet.imu)
         stamps.append(frame.stamp_ns + offset_ns)
-        detector.is_still(recent, stamps[-1], frame)
-        sigmas.append(np.nan if detector.velocity_sigma is None else detector.velocity_sigma)
+        sigma = detector.add_frame(recent, stamps[-1], frame)
+        sigmas.append(np.nan if sigma is None else sigma)
         recent.forget_before(stamps[-1] - _RECENT_NS)
         for c, seen in enumerate(frame.cameras):
             columns.append((seen.ids, np.full(len(seen), number), np.full(len(seen), c)))
