@@ -13,6 +13,7 @@ from typing import Any, TypeVar, cast
 import numba
 
 from slam_graph.interrupts import Interrupts
+from slam_graph.kernels.second_compiler import start_second_compiler
 
 __all__ = ["compiled"]
 
@@ -68,7 +69,7 @@ def _without_collection() -> Iterator[None]:
 
 
 def _tell(kernel: object) -> None:
-    """Say it once where a kernel was not in the cache: those that follow take seconds, too.
+    """Say it once where a kernel was not in the cache, and get help: others will take seconds, too.
 
     As a warning, which is shown where nothing has been set up to show logs yet.
     """
@@ -77,3 +78,4 @@ def _tell(kernel: object) -> None:
     if not _told and stats is not None and stats.cache_misses:
         _told = True
         logger.warning("compiling kernels: once on this machine, some 15 s")
+        start_second_compiler()
