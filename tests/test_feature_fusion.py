@@ -18,7 +18,12 @@ from slam_graph.backend.cost.reprojection import Geometry, RigProjection
 from slam_graph.backend.smoothing import final_adjustment
 from slam_graph.backend.smoothing.final_adjustment import adjust_recording
 from slam_graph.backend.smoothing.frame_log import FrameLog
-from slam_graph.backend.smoothing.projected_matches import Scene, consistent_matches, drift_jacobian
+from slam_graph.backend.smoothing.projected_matches import (
+    Scene,
+    consistent_matches,
+    drift_jacobian,
+    match_probabilities,
+)
 from slam_graph.backend.smoothing.recording_segment import read_segment, triangulated
 from slam_graph.backend.smoothing.smoothing_config import FinalBaConfig
 from slam_graph.backend.smoothing.track_fusion import fused_labels, relabelled
@@ -232,7 +237,7 @@ def test_a_common_drift_is_found_among_wrong_matches() -> None:
     agree, left = consistent_matches(J, offsets, 3.0, 0.001, 1, rng)
     assert agree[:12].all()
     assert agree[12:].sum() <= 1
-    assert np.all(left[:12] < 3.0)
+    assert np.all(np.linalg.norm(left[:12], axis=1) < 3.0)
 
 
 def test_chance_agrees_on_no_drift() -> None:
@@ -246,6 +251,27 @@ def test_chance_agrees_on_no_drift() -> None:
         agree, _ = consistent_matches(J, offsets, 3.0, 0.01, 200, rng)
         found += bool(agree.any())
     assert found <= 1
+
+
+@pytest.mark.parametrize(("share", "least"), [(0.0, 0.0), (0.25, 0.4), (0.8, 0.9)])
+def test_probabilities_of_matches_are_their_frequencies(share: float, least: float) -> None:
+    """Sets of 40, of which some are true: of those that are believed few are false."""
+    rng = np.random.default_rng(3)
+    reach, count = 10.0, 40
+    found = wrong = expected = 0.0
+    for _ in range(200):
+        true = np.arange(count) < round(share * count)
+        radius, angle = reach * np.sqrt(rng.random(count)), rng.uniform(-np.pi, np.pi, count)
+        uniform = np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1)
+        offsets = np.where(true[:, None], rng.normal(size=(count, 2)), uniform)
+        probabilities = match_probabilities(offsets, np.full(count, reach**-2.0))
+        good = probabilities > 0.9
+        found, wrong = found + np.sum(good & true), wrong + np.sum(good & ~true)
+        expected += np.sum(1.0 - probabilities[good])
+    # a set without true ones has now and then a few that are close by chance
+    assert wrong <= 1.5 * expected + 0.005 * 200 * count
+    # the fewer are true, the closer they must be
+    assert found >= least * share * 200 * count
 
 
 def test_a_turn_about_the_vertical_is_what_its_derivative_says() -> None:

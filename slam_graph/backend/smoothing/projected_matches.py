@@ -34,6 +34,7 @@ _DRIFT_SIGMAS = np.array([0.1, 0.1, 0.1, 0.02])
 _MAX_FALSE_ALARMS = 0.01
 _SAMPLES = 100
 _REFINEMENTS = 3
+_EM_STEPS = 30
 
 
 def drift_jacobian(by_point: FloatArray, arms: FloatArray) -> FloatArray:
@@ -70,35 +71,54 @@ def consistent_matches(
 
     Returns:
         consistent: (P,) all false if the set may be chance.
-        residuals: (P,) length of each offset after removal of the drift.
+        residuals: (P, m) offsets after removal of the drift.
     """
     count, chance = len(offsets), min(limit**2 * chance, 1.0)
-    lengths = np.linalg.norm(offsets, axis=1)
-    undrifted = lengths < limit
+    undrifted = np.linalg.norm(offsets, axis=1) < limit
     alarms = tests * bdtrc(np.sum(undrifted) - 1, count, chance)
     consistent, residuals = _largest_set(J, offsets, limit, rng)
     if alarms < _MAX_FALSE_ALARMS and np.sum(undrifted) >= np.sum(consistent):
-        return undrifted, lengths
+        return undrifted, offsets
     # two matches were sampled to fit
     drifted = tests * math.comb(count, 2) * bdtrc(np.sum(consistent) - 3, count - 2, chance)
     if drifted < _MAX_FALSE_ALARMS:
         return consistent, residuals
-    return undrifted & (alarms < _MAX_FALSE_ALARMS), lengths
+    return undrifted & (alarms < _MAX_FALSE_ALARMS), offsets
 
 
 def _largest_set(
     J: FloatArray, offsets: FloatArray, limit: float, rng: np.random.Generator
 ) -> tuple[BoolArray, FloatArray]:
-    """The largest set (P,) consistent with one drift, and the residuals (P,) of all offsets."""
+    """The largest set (P,) consistent with one drift, and what is left (P, m) of all offsets."""
     pairs = rng.permuted(np.tile(np.arange(len(J)), (_SAMPLES, 1)), axis=1)[:, :2]
     drifts = _least_squares(J[pairs], offsets[pairs])
     residuals = np.linalg.norm(offsets - np.einsum("pij,sj->spi", J, drifts), axis=2)
     consistent = residuals[np.argmax(np.sum(residuals < limit, axis=1))] < limit
     for _ in range(_REFINEMENTS):
         drift = _least_squares(J[None, consistent], offsets[None, consistent])[0]
-        refined = np.linalg.norm(offsets - J @ drift, axis=1)
-        consistent = refined < limit
+        refined = offsets - J @ drift
+        consistent = np.linalg.norm(refined, axis=1) < limit
     return consistent, refined
+
+
+def match_probabilities(residuals: FloatArray, chances: FloatArray) -> FloatArray:
+    """Probability of each match of a set to be true, by expectation maximisation.
+
+    In the image residuals of true matches are normal with unit covariance, and those of false ones
+    uniform. The share of true ones is found from the set itself: where most matches are false, one
+    must be closer to be believed.
+
+    Args:
+        residuals: (P, m) in standard deviations; the first two are in the image.
+        chances: (P,) probability that a false match has an offset below a standard deviation.
+    """
+    true = np.exp(-0.5 * np.sum(residuals[:, :2] ** 2, axis=1)) / (2.0 * math.pi)
+    false = chances / math.pi
+    probabilities = np.full(len(residuals), 0.5)
+    for _ in range(_EM_STEPS):
+        share = np.mean(probabilities)
+        probabilities = share * true / (share * true + (1.0 - share) * false)
+    return probabilities
 
 
 def _least_squares(J: FloatArray, offsets: FloatArray) -> FloatArray:

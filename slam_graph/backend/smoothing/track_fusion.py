@@ -30,6 +30,7 @@ from slam_graph.backend.smoothing.projected_matches import (
     Matches,
     Scene,
     consistent_matches,
+    match_probabilities,
     projected_matches,
 )
 from slam_graph.backend.smoothing.recording_problem import BundleAdjustment
@@ -48,13 +49,15 @@ _VISIT_S = 6.0
 """Length of a visit: the drift within it is negligible."""
 _MAX_OFFSET = 3.0
 """Largest offset of a match after removal of the drift, in standard deviations."""
+_LEAST_PROBABILITY = 0.95
+"""Of a match to be true: a false one bends the map as a false loop closure does."""
 _SEED = 0
 """Of RANSAC."""
 _THINNING = 2
 """One of this many keyframes is in the loose bundle adjustments."""
 _MAX_ROUNDS = 10
 _SETTLED = 0.1
-"""Rounds end when less than this part of the fused features changes."""
+"""Rounds end when less than this part of the fused features differs from an earlier round."""
 
 
 def with_fused_features(
@@ -92,12 +95,15 @@ def with_fused_features(
         return states
 
     states, own = adjusted(segment, states), np.arange(len(segment.seen.ids))
-    before = own
+    tried = [own]
     for _ in range(_MAX_ROUNDS):
         label = _labels(segment, states, task.rig, task.backend)
-        if np.sum(label != before) <= _SETTLED * np.sum(label != own):
+        # a few features may be fused and separated in turn
+        least = min(int(np.sum(label != before)) for before in tried)
+        if least <= _SETTLED * np.sum(label != own):
             break
-        states, before = adjusted(_relabelled(segment, label), states), label
+        tried.append(label)
+        states = adjusted(_relabelled(segment, label), states)
     return SegmentStart(_relabelled(segment, label), states, anchor), steps
 
 
@@ -171,7 +177,10 @@ def _confirmed(matches: Matches, times_s: FloatArray) -> tuple[BoolArray, FloatA
     rng = np.random.default_rng(_SEED)
     first_s, second_s = times_s[matches.earlier], times_s[matches.later]
     residuals = np.linalg.norm(matches.offsets, axis=1)
-    good = (second_s - first_s < _VISIT_S) & (residuals < _MAX_OFFSET)
+    close = np.flatnonzero(second_s - first_s < _VISIT_S)
+    good = np.zeros(len(residuals), np.bool_)
+    probable = match_probabilities(matches.offsets[close], matches.chances[close])
+    good[close] = (probable > _LEAST_PROBABILITY) & (residuals[close] < _MAX_OFFSET)
     far = np.flatnonzero(second_s - first_s >= _VISIT_S)
     for half in range(4):  # visits overlap by half, so that none is cut
         first = np.floor(first_s[far] / _VISIT_S + 0.5 * (half % 2)).astype(np.int64)
@@ -180,11 +189,13 @@ def _confirmed(matches: Matches, times_s: FloatArray) -> tuple[BoolArray, FloatA
         starts = np.flatnonzero(np.diff(first[order]) | np.diff(second[order])) + 1
         groups = [group for group in np.split(far[order], starts) if len(group) > 2]
         for group in groups:
-            chance = float(np.mean(matches.chances[group]))
+            chances = matches.chances[group]
             J, offsets = matches.by_drift[group], matches.offsets[group]
-            consistent, after = consistent_matches(
-                J, offsets, _MAX_OFFSET, chance, len(groups), rng
+            consistent, left = consistent_matches(
+                J, offsets, _MAX_OFFSET, float(np.mean(chances)), len(groups), rng
             )
+            consistent &= match_probabilities(left, chances) > _LEAST_PROBABILITY
+            after = np.linalg.norm(left, axis=1)
             better = consistent & (~good[group] | (after < residuals[group]))
             good[group] |= consistent
             residuals[group[better]] = after[better]
