@@ -15,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from commands import slam_graph
 from limits import HANG_S
 from test_batch import command as batch
 from test_batch import flight, wait_for, worker_of
@@ -40,9 +41,7 @@ SHORT_SIM = [f"--sim-set={text}" for text in ("duration_s=6", "rate_hz=10", "tra
 
 
 def compare(*arguments: str | Path) -> subprocess.CompletedProcess:
-    return subprocess.run(
-        [*COMMAND, *map(str, arguments)], capture_output=True, text=True, timeout=HANG_S
-    )
+    return slam_graph("compare", *arguments)
 
 
 @pytest.fixture(scope="module")
