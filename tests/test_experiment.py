@@ -280,16 +280,17 @@ def test_peak_memory_is_of_this_process_and_never_falls() -> None:
     assert block.nbytes / 2**20 < after
 
 
-@pytest.fixture
-def scheduler(tmp_path: Path) -> Iterator[str]:
+@pytest.fixture(scope="module")
+def scheduler(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     """Address of a real Dask scheduler with one real worker, on loopback."""
-    file = tmp_path / "scheduler.json"
+    folder = tmp_path_factory.mktemp("dask")
+    file = folder / "scheduler.json"
     environment = {**os.environ, **ONE_THREAD}
     dask = [sys.executable, "-m", "dask"]
     options = ["--scheduler-file", str(file), "--no-dashboard"]
     commands = (
         [*dask, "scheduler", "--host", "127.0.0.1", "--port", "0", *options],
-        [*dask, "worker", "--nthreads", "2", "--local-directory", str(tmp_path), *options],
+        [*dask, "worker", "--nthreads", "2", "--local-directory", str(folder), *options],
     )
     processes = [
         subprocess.Popen(
