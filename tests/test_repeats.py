@@ -52,7 +52,7 @@ def run_all(recording: Path, output: Path, threads: int, overlap: bool) -> None:
 @pytest.fixture(scope="module")
 def both(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     root = tmp_path_factory.mktemp("repeats")
-    simulate(kind="images", duration_s=2.0, rate_hz=10.0).save(root / "flight")
+    simulate(kind="images", duration_s=3.0, rate_hz=10.0).save(root / "flight")
     first, second = root / "first", root / "second"
     run_all(root / "flight", first, 1, False)
     run_all(root / "flight", second, 2, True)
