@@ -36,9 +36,11 @@ PLACES = [(49.0, 8.4, 115.0), (-33.9, 151.2, 20.0), (64.1, -21.9, 0.0), (0.01, 1
 
 
 def drive(duration_s: float, seed: int = 1, **settings: object) -> SimulatedSequence:
-    """A car without an IMU, 10 frames a second."""
-    few = {"rate_hz": 10.0, "with_imu": False, "tracks": {"features": 60}}
-    return simulate(trajectory="car", duration_s=duration_s, seed=seed, **(few | settings))
+    """A car without an IMU."""
+    few = {"features": 60}
+    return simulate(
+        trajectory="car", duration_s=duration_s, seed=seed, with_imu=False, tracks=few, **settings
+    )
 
 
 # --- geodesy -------------------------------------------------------------------------------------
@@ -337,7 +339,6 @@ def test_fixes_bound_the_error_of_odometry_that_drifts() -> None:
         sequence = simulate(
             trajectory="car",
             duration_s=100.0,
-            rate_hz=10.0,
             seed=2,
             with_imu=False,
             tracks=poor,
@@ -366,7 +367,6 @@ def test_odometry_helps_where_few_features_are_seen() -> None:
         sequence = simulate(
             trajectory="car",
             duration_s=40.0,
-            rate_hz=10.0,
             seed=3,
             with_imu=False,
             tracks=poor,

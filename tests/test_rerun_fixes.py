@@ -37,7 +37,6 @@ def drive() -> Sequence:
     return sg.simulate(
         trajectory="car",
         duration_s=40.0,
-        rate_hz=10.0,
         with_imu=False,
         seed=1,
         tracks={"features": 60},
