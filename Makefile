@@ -9,9 +9,9 @@ VENV := .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check
 
-# A file of tests stays on one core, so that what its tests share is made once. Measured on two
-# cores: 8.3 and 8.0 minutes of work for the two of them, as even as dealing out single tests.
-PARALLEL ?= -n logical --dist loadfile
+# A file of tests stays on one core, so that what its tests share is made once. Files are dealt out
+# in the order of tests/conftest.py, long ones first, instead of by their number of tests.
+PARALLEL ?= -n logical --dist loadfile --no-loadscope-reorder
 
 # Matrices here are a few hundred wide: threads of BLAS cost more than they bring.
 export OPENBLAS_NUM_THREADS ?= 1

@@ -25,6 +25,19 @@ def pytest_sessionstart(session: pytest.Session) -> None:
             import_module(f"slam_graph.kernels.{module.name}")
 
 
+LONGEST = (
+    "position_fixes", "verdict", "recovery", "notebooks", "without_imu", "repeats", "policy_nees",
+    "clock_monitor", "estimator_end_to_end", "documented_start", "known_poses", "clock_windows",
+)  # fmt: skip
+"""Files of tests that take a minute or two each; they begin, so that no core ends with one."""
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Long files first; otherwise the order stays. Xdist deals out files in this order."""
+    first = {f"test_{name}.py": place for place, name in enumerate(LONGEST)}
+    items.sort(key=lambda item: first.get(item.path.name, len(first)))
+
+
 @pytest.fixture(scope="session")
 def data_dir() -> Path:
     """The folder of recordings; without it the test is skipped, or fails if data is required."""

@@ -207,8 +207,8 @@ def _redirected(words: list[str]) -> tuple[list[str], str]:
     return (words[:-2], words[-1]) if ">" in words[-2:-1] else (words, "")
 
 
-def replace_what_is_slow(monkeypatch: pytest.MonkeyPatch, demo: Path) -> None:
-    """A short `demo`, no windows, and tasks in this process."""
+def do_tasks_here(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Tasks of `batch` and `compare` in this process, which has imported everything, in turn."""
     one_at_a_time = threading.Lock()
 
     def do(text: str, wanted: object = None) -> str | None:
@@ -219,6 +219,13 @@ def replace_what_is_slow(monkeypatch: pytest.MonkeyPatch, demo: Path) -> None:
             return str(error)
         return None
 
+    monkeypatch.setattr(executors, "_TaskProcess", lambda text: text)
+    monkeypatch.setattr(executors, "_wait", do)
+
+
+def replace_what_is_slow(monkeypatch: pytest.MonkeyPatch, demo: Path) -> None:
+    """A short `demo`, no windows, and tasks in this process."""
+
     def to_memory(stream: Any) -> None:
         stream._raw.memory_recording()
 
@@ -226,8 +233,7 @@ def replace_what_is_slow(monkeypatch: pytest.MonkeyPatch, demo: Path) -> None:
     monkeypatch.setattr(Picture, "png", lambda picture: empty)
     for module in (dataset_registry, eqvio):
         monkeypatch.setattr(module, "wheel_tracks", lambda: demo)
-    monkeypatch.setattr(executors, "_TaskProcess", lambda text: text)
-    monkeypatch.setattr(executors, "_wait", do)
+    do_tasks_here(monkeypatch)
     monkeypatch.setattr(RerunStream, "_spawn", to_memory)
     monkeypatch.setattr(RerunRecording, "open", staticmethod(lambda recording: None))
 

@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from commands import slam_graph
 from limits import HANG_S
 from recordings_loose import write_image_folder
 
@@ -60,7 +61,7 @@ def command(*arguments: str | Path) -> list[str]:
 
 
 def batch(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(command(*arguments), capture_output=True, text=True, timeout=HANG_S)
+    return slam_graph("batch", *arguments)
 
 
 def tasks(what: Path | str, output: Path, **options: Any) -> list[BatchTask]:

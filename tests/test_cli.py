@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from commands import slam_graph
 from limits import HANG_S
 from typer.testing import CliRunner
 
@@ -34,16 +35,6 @@ COMMANDS = (
 )
 
 TUM = "0.0 0 0 0 0 0 0 1\n1.0 1 0 0 0 0 0 1\n2.0 1 1 0 0 0 0 1\n3.0 1 1 1 0 0 0 1\n"
-
-
-def slam_graph(*arguments: str | Path, cwd: Path | None = None) -> subprocess.CompletedProcess:
-    return subprocess.run(
-        [sys.executable, "-m", "slam_graph.cli.main", *map(str, arguments)],
-        capture_output=True,
-        text=True,
-        cwd=cwd,
-        timeout=HANG_S,
-    )
 
 
 def answer(*arguments: str | Path) -> dict:

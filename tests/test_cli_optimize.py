@@ -4,20 +4,17 @@
 
 import json
 import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
-from limits import HANG_S
+from commands import slam_graph
 from pose_graphs import laps
 from typer.testing import CliRunner
 
 from slam_graph.cli.main import app
 from slam_graph.errors import SlamGraphError
 from slam_graph.pose_graph.graph_files import g2o_lines, read_pose_graph
-
-COMMAND = [sys.executable, "-m", "slam_graph.cli.main", "optimize"]
 
 FILES = {
     "optimized.g2o",
@@ -31,13 +28,7 @@ FILES = {
 
 
 def run(tmp_path: Path, *arguments: str | Path) -> subprocess.CompletedProcess:
-    return subprocess.run(
-        [*COMMAND, *map(str, arguments)],
-        capture_output=True,
-        text=True,
-        cwd=tmp_path,
-        timeout=HANG_S,
-    )
+    return slam_graph("optimize", *arguments, cwd=tmp_path)
 
 
 def refused(

@@ -11,6 +11,7 @@ from functools import partial
 from pathlib import Path
 
 import pytest
+from commands import slam_graph
 from limits import HANG_S
 
 from slam_graph.config import load_config
@@ -40,13 +41,7 @@ SHORT = ("--duration", "3", "--set", "min_coverage=0.1", *STATIC)
 
 
 def run(tmp_path: Path, *arguments: str | Path) -> subprocess.CompletedProcess:
-    return subprocess.run(
-        [*COMMAND, *map(str, arguments)],
-        capture_output=True,
-        text=True,
-        cwd=tmp_path,
-        timeout=HANG_S,
-    )
+    return slam_graph("run", *arguments, cwd=tmp_path)
 
 
 def latest(tmp_path: Path) -> Path:
@@ -167,17 +162,7 @@ def test_ground_truth_is_compared_and_pictured(tmp_path: Path, data_dir: Path) -
     assert metrics["nees"]["alignment"] == "none"
     ours = metrics["accuracy"]["se3"]["ate"]["translation_m"]["rmse"]
     folder = latest(tmp_path)
-    ape = subprocess.run(
-        [
-            *COMMAND[:-1],
-            "ape",
-            folder / "groundtruth.tum",
-            folder / "trajectory.tum",
-            "-a",
-            "--json",
-        ],
-        capture_output=True,
-        check=True,
-    )
+    ape = slam_graph("ape", folder / "groundtruth.tum", folder / "trajectory.tum", "-a", "--json")
+    assert ape.returncode == 0
     # the files are rounded to 1e-9 m
     assert json.loads(ape.stdout)["statistics"]["rmse"] == pytest.approx(ours, abs=1e-8)

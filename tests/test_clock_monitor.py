@@ -55,8 +55,9 @@ def found_in(
 
 def changes(recording: RecordedSequence, done: bool = False) -> list[tuple[float, ClockChange]]:
     """Changes alone; nothing else is found."""
-    found = [(at, x) for at, x in found_in(recording, done) if isinstance(x, ClockChange)]
-    assert len(found) == len(found_in(recording, done))
+    everything = found_in(recording, done)
+    found = [(at, x) for at, x in everything if isinstance(x, ClockChange)]
+    assert len(found) == len(everything)
     return found
 
 

@@ -11,6 +11,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from commands import slam_graph
 
 from slam_graph.cli.main import main
 from slam_graph.errors import DataError
@@ -62,21 +63,8 @@ class Stock:
 
         Matplotlib looks for fonts only once, unless the folder for what it found is another one.
         """
-
-        def bound() -> None:
-            signal.signal(signal.SIGXFSZ, signal.SIG_IGN)  # to write gives an error then
-            if limit is not None:
-                resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
-
-        return subprocess.run(
-            [sys.executable, "-m", "slam_graph.cli.launch", *arguments],
-            cwd=folder,
-            capture_output=True,
-            text=True,
-            timeout=HANG_S,
-            preexec_fn=bound,
-            env={**os.environ, "MPLCONFIGDIR": str(fonts or self.fonts)},
-        )
+        env = {**os.environ, "MPLCONFIGDIR": str(fonts or self.fonts)}
+        return slam_graph(*arguments, cwd=folder, env=env, limit=limit)
 
 
 @pytest.fixture(scope="module")

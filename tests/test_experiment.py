@@ -15,6 +15,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from commands import slam_graph
+from documented_runs import do_tasks_here
 from limits import HANG_S
 from test_batch import command as batch
 from test_batch import flight, wait_for, worker_of
@@ -40,9 +42,13 @@ SHORT_SIM = [f"--sim-set={text}" for text in ("duration_s=6", "rate_hz=10", "tra
 
 
 def compare(*arguments: str | Path) -> subprocess.CompletedProcess:
-    return subprocess.run(
-        [*COMMAND, *map(str, arguments)], capture_output=True, text=True, timeout=HANG_S
-    )
+    return slam_graph("compare", *arguments)
+
+
+@pytest.fixture
+def here(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Tasks are done in this process: not what is tested where this is used."""
+    do_tasks_here(monkeypatch)
 
 
 @pytest.fixture(scope="module")
@@ -58,7 +64,7 @@ def simulated(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict]:
 
 @pytest.mark.parametrize(("cameras", "alignment"), [(2, "se3"), (1, "sim3")])
 def test_without_an_imu_errors_are_aligned_in_what_nothing_measured(
-    tmp_path: Path, cameras: int, alignment: str
+    here: None, tmp_path: Path, cameras: int, alignment: str
 ) -> None:
     found = compare_algorithms(
         "sim:random",
@@ -78,7 +84,9 @@ def test_without_an_imu_errors_are_aligned_in_what_nothing_measured(
     assert (tmp_path / "figures" / "sim_random_errors.png").is_file()
 
 
-def test_errors_in_the_world_of_the_fixes_are_beside_the_aligned_ones(tmp_path: Path) -> None:
+def test_errors_in_the_world_of_the_fixes_are_beside_the_aligned_ones(
+    here: None, tmp_path: Path
+) -> None:
     """Yaw and position are not aligned there: both are the error of the run and of its world."""
     found = compare_algorithms(
         "sim:random",
@@ -281,16 +289,17 @@ def test_peak_memory_is_of_this_process_and_never_falls() -> None:
     assert block.nbytes / 2**20 < after
 
 
-@pytest.fixture
-def scheduler(tmp_path: Path) -> Iterator[str]:
+@pytest.fixture(scope="module")
+def scheduler(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     """Address of a real Dask scheduler with one real worker, on loopback."""
-    file = tmp_path / "scheduler.json"
+    folder = tmp_path_factory.mktemp("dask")
+    file = folder / "scheduler.json"
     environment = {**os.environ, **ONE_THREAD}
     dask = [sys.executable, "-m", "dask"]
     options = ["--scheduler-file", str(file), "--no-dashboard"]
     commands = (
         [*dask, "scheduler", "--host", "127.0.0.1", "--port", "0", *options],
-        [*dask, "worker", "--nthreads", "2", "--local-directory", str(tmp_path), *options],
+        [*dask, "worker", "--nthreads", "2", "--local-directory", str(folder), *options],
     )
     processes = [
         subprocess.Popen(
@@ -380,7 +389,7 @@ def test_a_start_with_an_error_of_its_covariance_keeps_that_covariance(tmp_path:
         assert task.config.backend.initialization.fix_gauge is fixed
 
 
-def test_compare_from_python(tmp_path: Path) -> None:
+def test_compare_from_python(here: None, tmp_path: Path) -> None:
     """One algorithm over chosen seeds; a second call with one more does only that."""
     told: list[str] = []
     options = {"simulation": ["duration_s=4", "rate_hz=10", "tracks.features=40"]}
@@ -401,7 +410,7 @@ def test_compare_from_python(tmp_path: Path) -> None:
     assert told == ["tracks of sim_figure8, seed 5", "swf on sim_figure8, seed 5"]
 
 
-def test_fixes_that_lie_elsewhere_are_compared_with(tmp_path: Path) -> None:
+def test_fixes_that_lie_elsewhere_are_compared_with(here: None, tmp_path: Path) -> None:
     """Named as a source they are recorded with the tracks; changed ones are recorded anew."""
     drive, fixes = tmp_path / "drive", tmp_path / "fixes.csv"
     settings = {"with_imu": False, "seed": 1, "tracks": {"features": 60}}

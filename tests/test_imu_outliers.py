@@ -101,7 +101,9 @@ def test_a_block_of_shaking_is_no_spike(flown: ImuData) -> None:
 def error_m(*faults: str) -> float:
     """Of a run that ends well."""
     config = load_config(algorithm="msckf", overrides=["final_ba.enabled=false"])
-    sequence = inject(simulate(trajectory="figure8", cameras=2, duration_s=20.0), faults)
+    sequence = inject(
+        simulate(trajectory="figure8", cameras=2, duration_s=20.0, rate_hz=10.0), faults
+    )
     result = run(sequence, config)
     assert result.status == "ok", result.message
     truth = sequence.groundtruth()

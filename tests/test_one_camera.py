@@ -41,7 +41,8 @@ SECOND = gtsam.Pose3(gtsam.Rot3.Expmap([0.02, -0.05, 0.03]), np.array([0.6, -0.2
 def simulated(**settings: Any) -> SimulatedSequence:
     """Tracks of a flight with one camera and without an IMU."""
     asked = {
-        "with_imu": False, "cameras": 1, "duration_s": 8.0, "seed": 4, "trajectory": "random"
+        "with_imu": False, "cameras": 1, "duration_s": 8.0, "rate_hz": 10.0,
+        "seed": 4, "trajectory": "random"
     }  # fmt: skip
     return simulate(**(asked | settings))
 

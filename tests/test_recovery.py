@@ -33,9 +33,14 @@ CAUSAL = ("final_ba.enabled=false",)
 FAULT_S, BLIND_S = 6.0, 3.0
 
 
-def flown(*faults: str, algorithm: str = "msckf", settings: tuple[str, ...] = CAUSAL) -> RunResult:
+def flown(
+    *faults: str,
+    algorithm: str = "msckf",
+    settings: tuple[str, ...] = CAUSAL,
+    rate_hz: float = 10.0,
+) -> RunResult:
     """A run over 16 s of simulated stereo."""
-    sequence = simulate(trajectory="figure8", cameras=2, duration_s=16.0, seed=1)
+    sequence = simulate(trajectory="figure8", cameras=2, duration_s=16.0, rate_hz=rate_hz, seed=1)
     return run(inject(sequence, faults), algorithm=algorithm, overrides=settings)
 
 
@@ -116,7 +121,7 @@ def test_being_carried_away_is_noticed_whatever_is_in_the_cost(algorithm: str) -
 
 
 def test_a_jump_to_where_everything_fits_is_noticed_by_the_tracks_across_it() -> None:
-    result = flown("kidnapped:at_s=6,duration_s=1")
+    result = flown("kidnapped:at_s=6,duration_s=1", rate_hz=20.0)
     assert [segment.joined_by for segment in result.segments] == ["start", "none"]
     assert "not across it" in result.segments[0].ended_by
     assert max(error_m(result, 0), error_m(result, 1)) < 0.02

@@ -45,7 +45,8 @@ CAMERA = Camera(500.0, 510.0, 320.0, 240.0, "none", (), 640, 480)
 
 def simulated(**settings: Any) -> SimulatedSequence:
     """Tracks of a flight without an IMU."""
-    asked = {"with_imu": False, "duration_s": 8.0, "seed": 3, "trajectory": "random"}
+    asked = {"with_imu": False, "duration_s": 8.0, "rate_hz": 10.0, "seed": 3}
+    asked["trajectory"] = "random"
     return simulate(**(asked | settings))
 
 
