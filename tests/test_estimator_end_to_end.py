@@ -30,12 +30,9 @@ def rmse(
 
 
 @pytest.mark.data
-@pytest.mark.parametrize("algorithm", [pytest.param("msckf", marks=pytest.mark.slow), "swf"])
+@pytest.mark.parametrize("algorithm", ["msckf", "swf"])
 def test_the_wheels_tracks(data_dir: Path, algorithm: str) -> None:
-    """Monocular, at rest for five seconds, without being told the start state.
-
-    The gate measures this and what follows under both algorithms, whole recordings each time.
-    """
+    """Monocular, at rest for five seconds, without being told the start state."""
     truth = data_dir / "euroc_inertial" / "V1_01_easy"
     sequence = open_dataset("demo", groundtruth=truth)
     result = run(sequence, load_config(algorithm=algorithm))
@@ -49,9 +46,9 @@ def test_the_wheels_tracks(data_dir: Path, algorithm: str) -> None:
 @pytest.mark.parametrize(
     ("algorithm", "cameras", "position_m", "angle_deg"),
     [
-        pytest.param("msckf", 1, 0.019, 0.21, marks=pytest.mark.slow),
+        ("msckf", 1, 0.019, 0.21),
         ("msckf", 2, 0.015, 0.19),
-        pytest.param("swf", 2, 0.015, 0.19, marks=pytest.mark.slow),
+        ("swf", 2, 0.015, 0.19),
     ],
 )
 def test_a_simulation_from_a_given_start(

@@ -12,7 +12,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from slam_graph.config import RunConfig, load_config
+from slam_graph.config import load_config
 from slam_graph.datasets.dataset_registry import open_dataset
 from slam_graph.frontend.association import Association
 from slam_graph.frontend.lucas_kanade import CornerTracking
@@ -66,12 +66,7 @@ def folder(data_dir: Path) -> Path:
 
 @pytest.fixture(scope="module")
 def clean_m(folder: Path) -> float:
-    return ate_m(run(open_dataset(folder), causal(8)))
-
-
-def causal(duration_s: float) -> RunConfig:
-    """Without the final adjustment, at which nobody looks here."""
-    return load_config(duration_s=duration_s, final_ba={"enabled": False})
+    return ate_m(run(open_dataset(folder), load_config(duration_s=8)))
 
 
 def ate_m(result: RunResult) -> float:
@@ -96,7 +91,7 @@ def test_a_run_survives_dark_saturated_blurred_and_blank_images(folder: Path) ->
         return image
 
     kept = Kept()
-    result = run(Edited(folder, spoil), causal(10.5), recorder=kept)
+    result = run(Edited(folder, spoil), load_config(duration_s=10.5), recorder=kept)
     assert ate_m(result) < 0.0105
     assert result.coverage > 0.8
     assert result.warnings["few_features"] > 0
@@ -121,7 +116,7 @@ def test_random_matches_do_little_harm(
         return Association(points, found.good | wrong, lost)
 
     monkeypatch.setattr(CornerTracking, "follow", spoilt)
-    result = run(open_dataset(folder), causal(8))
+    result = run(open_dataset(folder), load_config(duration_s=8))
     assert result.logs.features["rejected_ransac"] > 0.15 * result.logs.features["tracked"]
     assert ate_m(result) < 2.0 * clean_m
 
@@ -162,7 +157,7 @@ def test_a_moving_wall_does_little_harm(folder: Path, clean_m: float, since_s: f
     wall = MovingWall(open_dataset(folder).rig, since_s)
     black = wall(np.zeros((480, 752), np.uint8), 0, 5.0)
     assert 0.25 < np.mean(black > 0) < 0.4
-    result = run(Edited(folder, wall), causal(8))
+    result = run(Edited(folder, wall), load_config(duration_s=8))
     assert (result.trajectory.stamps_ns[0] - result.input.start_ns) * 1e-9 < 2.0
     assert ate_m(result) < 1.65 * clean_m
 

@@ -43,8 +43,6 @@ CHECKED_FRAMES = (4, 7)
 TOLERANCE = 1e-5
 """Relative error of variances that rounding leaves."""
 FEW, MANY = 3, 1000
-SHARE = 0.3
-"""Of the combinations of each selection of poses and feature policy; `make slow` tries all."""
 TRIANGULATION = TriangulationConfig(min_parallax_rad=0.0, max_depth_m=1e6)
 LOOSE = BackendConfig(
     noise=CONFIG.noise,
@@ -170,24 +168,14 @@ def batches() -> list[tuple[Rig, Batch]]:
     return [(mounted, Batch(mounted)) for mounted in (rig(1), rig(2))]
 
 
-def sampled(algorithms: Iterator[AlgorithmConfig], share: float) -> list[AlgorithmConfig]:
-    """A share of them, always the same ones, in random order: no setting goes with one rig."""
-    every = list(algorithms)
-    chosen = np.random.default_rng(11).choice(len(every), round(share * len(every)), replace=False)
-    return [every[row] for row in chosen]
-
-
-@pytest.mark.parametrize(
-    "share", [SHARE, pytest.param(1.0, marks=pytest.mark.slow)], ids=["sample", "all"]
-)
 @pytest.mark.parametrize("features", [*FEATURE_POLICIES, FROM_OUTSIDE[1]])
 @pytest.mark.parametrize("past_poses", [*POSE_SELECTIONS, FROM_OUTSIDE[0]])
 def test_no_measurement_counts_twice(
-    past_poses: str, features: str, share: float, batches: list[tuple[Rig, Batch]]
+    past_poses: str, features: str, batches: list[tuple[Rig, Batch]]
 ) -> None:
     faults: list[str] = []
     seen: Counter[str] = Counter()
-    for number, algorithm in enumerate(sampled(accepted(past_poses, features), share)):
+    for number, algorithm in enumerate(accepted(past_poses, features)):
         mounted, truth = batches[number % 2]
         estimator = Estimator(mounted, algorithm, LOOSE)
         estimator.start(truth.start)
