@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from slam_graph.arrays import FloatArray
 from slam_graph.backend.cost.reprojection import RigProjection
-from slam_graph.backend.initialization.gyroscope_bias import _pairs, _Planes
+from slam_graph.backend.initialization.gyroscope_bias import BearingPairs, _pairs, _Planes
 from slam_graph.backend.initialization.inertial_motion import Intervals
 from slam_graph.backend.initialization.start_consensus import constrained_solutions
 from slam_graph.backend.initialization.visual_inertial_alignment import constrained_solution
@@ -148,10 +148,11 @@ def test_the_derivative_by_the_gyroscope_bias() -> None:
     points = room(300, rng)
     frames = [features(flight, mounted, points, t_s, rng) for t_s in times_s]
     samples = [flight.imu(a, b) for a, b in pairwise(times_s)]
-    pairs = _pairs(frames, Intervals(samples), RigProjection(mounted), np.full(3, 0.02))
+    common = BearingPairs.between(frames, RigProjection(mounted))
+    pairs = _pairs(common, Intervals(samples), np.full(3, 0.02))
     assert pairs is not None
     step, axes = 1e-4, np.eye(3)
-    weights = rng.uniform(0.5, 1.0, (len(pairs.interval), 1))
+    weights = rng.uniform(0.5, 1.0, len(pairs.interval))
 
     def half_squares(change: FloatArray) -> FloatArray:
         return 0.5 * _Planes(change, pairs).squares
@@ -159,10 +160,12 @@ def test_the_derivative_by_the_gyroscope_bias() -> None:
     gradients, hessian, _ = _Planes(np.zeros(3), pairs).derivatives(weights)
     slopes = [(half_squares(step * e) - half_squares(-step * e)) / (2.0 * step) for e in axes]
     scale = np.abs(slopes).max()
-    np.testing.assert_allclose(gradients, weights * np.column_stack(slopes), atol=1e-5 * scale)
+    np.testing.assert_allclose(
+        gradients, weights[:, None] * np.column_stack(slopes), atol=1e-5 * scale
+    )
 
     def total(i: int, j: int) -> float:
-        return float(weights[:, 0] @ half_squares(step * (i * axes[a] + j * axes[b])))
+        return float(weights @ half_squares(step * (i * axes[a] + j * axes[b])))
 
     for a, b in product(range(3), repeat=2):
         bend = (total(1, 1) - total(1, -1) - total(-1, 1) + total(-1, -1)) / (4.0 * step**2)

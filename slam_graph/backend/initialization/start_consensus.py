@@ -17,13 +17,9 @@ from __future__ import annotations
 import numpy as np
 
 from slam_graph.arrays import BoolArray, FloatArray
-from slam_graph.backend.cost.feature_factors import eliminate_points
-from slam_graph.backend.cost.feature_tracks import Observations
-from slam_graph.backend.cost.reprojection import RigProjection
-from slam_graph.backend.initialization.inertial_motion import Motion
 from slam_graph.backend.initialization.visual_inertial_alignment import (
     MIN_DEPTH_M,
-    alignment_equations,
+    AlignmentEquations,
     secular_multipliers,
 )
 
@@ -38,6 +34,12 @@ _REFINEMENTS = 3
 """How often a sample is refined by its inliers."""
 _RIDGE = 1e-13
 """Keeps the equations of a sample solvable that does not determine the velocity."""
+_POINT_RIDGE = 1e-14
+"""Keeps those of a feature solvable that is seen without parallax."""
+_UPPER = np.triu_indices(4)
+"""Rows and columns of an upper triangle."""
+_FACTORS = (1.0, -1.0, -0.5)
+"""Of tᵖ a in the coefficients of position (p = 0), velocity (1) and gravity (2)."""
 
 
 class _Model:
@@ -46,17 +48,15 @@ class _Model:
     Motions (S, 6) are velocity and gravity in the frame of the first body.
     """
 
-    def __init__(
-        self, obs: Observations, motion: Motion, rig: RigProjection, gravity: float
-    ) -> None:
-        weights = np.ones(len(obs))
-        if rig.wide:  # errors are divided by distances, which are not depths towards the edge
-            weights = np.sqrt(1.0 + np.sum(obs.normalized**2, axis=1))
-        by_point, by_motion, b = alignment_equations(obs, motion, rig, weights)
-        others = np.concatenate([by_motion, b[:, :, None]], axis=2)
-        R, rest = eliminate_points(obs, by_point, others)
-        rows, count = rest[:, 3:], len(obs.ids)
-        self._squares = (rows.transpose(0, 2, 1) @ rows).reshape(count, 49)
+    def __init__(self, equations: AlignmentEquations, gravity: float) -> None:
+        obs, motion = equations.obs, equations.motion
+        H = _normal_equations(equations)
+        of_point, others = H[:, :3, :3], H[:, :3, 3:]
+        size = np.einsum("jii->j", of_point)[:, None, None] + 1e-300
+        by_motion = np.linalg.solve(of_point + _POINT_RIDGE * size * np.eye(3), others)
+        rest = H[:, 3:, 3:] - others.transpose(0, 2, 1) @ by_motion
+        count = len(obs.ids)
+        self._squares = rest.reshape(count, 49)
         self._gravity = gravity
         self._dof = np.maximum(2 * obs.counts - 3, 1)
         t = motion.times_s[obs.frame]
@@ -66,7 +66,7 @@ class _Model:
             return np.asarray(np.bincount(obs.feature, values, count) / obs.counts)
 
         # from the mean position of the body to the feature, by (velocity, gravity, -1)
-        away = -np.linalg.solve(R + 1e-9 * np.eye(3), rest[:, :3])
+        away = -by_motion
         away[:, :, :3] -= mean(t)[:, None, None] * np.eye(3)
         away[:, :, 3:6] -= 0.5 * mean(t**2)[:, None, None] * np.eye(3)
         for axis, column in enumerate(motion.displacements[obs.frame].T):
@@ -93,6 +93,38 @@ class _Model:
         return np.maximum(squares, 0.0) / self._dof / distances**2, distances
 
 
+def _normal_equations(equations: AlignmentEquations) -> FloatArray:
+    """Normal equations (J, 10, 10) of each feature: its position, velocity, gravity, b.
+
+    With the rows a of the position, those of velocity and gravity are -t a and -½ t² a. So all are
+    made of the sums over the observations of tᵖ aᵀ a, tᵖ aᵀ b and b².
+    """
+    obs, a, b, t = equations.obs, equations.by_point, equations.b, equations.times_s
+    if equations.rig.wide:  # errors are divided by distances, not by depths
+        weights = np.sqrt(1.0 + np.sum(obs.normalized**2, axis=1))
+        a, b = a * weights[:, None, None], b * weights[:, None]
+    columns = np.empty((2, 4, len(obs)))
+    columns[:, :3], columns[:, 3] = a.transpose(1, 2, 0), b.T
+    first, second = columns
+    products = first[_UPPER[0]] * first[_UPPER[1]]
+    products += second[_UPPER[0]] * second[_UPPER[1]]
+    S = np.empty((len(obs.ids), 5, 4, 4))
+    for power in range(5):
+        # the observations of a feature follow one another
+        sums = np.add.reduceat(products, obs.starts[:-1], axis=1).T
+        S[:, power, _UPPER[0], _UPPER[1]] = S[:, power, _UPPER[1], _UPPER[0]] = sums
+        products *= t
+    H = np.empty((len(S), 10, 10))
+    for i in range(3):
+        for k in range(3):
+            factor = _FACTORS[i] * _FACTORS[k]
+            H[:, 3 * i : 3 * i + 3, 3 * k : 3 * k + 3] = factor * S[:, i + k, :3, :3]
+        H[:, 3 * i : 3 * i + 3, 9] = _FACTORS[i] * S[:, i, :3, 3]
+        H[:, 9, 3 * i : 3 * i + 3] = H[:, 3 * i : 3 * i + 3, 9]
+    H[:, 9, 9] = S[:, 0, 3, 3]
+    return H
+
+
 def constrained_solutions(M: FloatArray, gravity: float) -> FloatArray:
     """Velocity and gravity (S, 6) of least squares under |g| = gravity, for many problems at once.
 
@@ -103,13 +135,14 @@ def constrained_solutions(M: FloatArray, gravity: float) -> FloatArray:
         M: (S, 7, 7) normal equations of velocity, gravity and right-hand side.
         gravity: its magnitude, m/s².
     """
-    size = np.trace(M[:, :6, :6], axis1=1, axis2=2)[:, None, None] + 1e-300
+    size = np.einsum("sii->s", M[:, :6, :6])[:, None, None] + 1e-300
     of_v = M[:, :3, :3] + _RIDGE * size * np.eye(3)
     with np.errstate(all="ignore"):
         by_g = np.linalg.solve(of_v, M[:, :3, 3:])
-        rest = M[:, 3:, 3:] - M[:, 3:, :3] @ by_g
-        values, vectors = np.linalg.eigh(np.nan_to_num(rest[:, :3, :3]))
-        projected = np.einsum("sji,sj->si", vectors, rest[:, :3, 3])
+        rest = M[:, 3:6, 3:] - M[:, 3:6, :3] @ by_g
+        of_g = np.where(np.isfinite(rest[:, :, :3]), rest[:, :, :3], 0.0)
+        values, vectors = np.linalg.eigh(of_g)
+        projected = np.einsum("sji,sj->si", vectors, rest[:, :, 3])
         g = projected / (values + secular_multipliers(values, projected, gravity))
         g *= gravity / np.linalg.norm(g, axis=1, keepdims=True)
         g = np.einsum("sij,sj->si", vectors, g)
@@ -141,38 +174,33 @@ def random_samples(count: int, rng: np.random.Generator) -> FloatArray:
 
 
 def static_features(
-    obs: Observations,
-    motion: Motion,
-    rig: RigProjection,
-    gravity: float,
-    tolerance: float,
-    rng: np.random.Generator,
+    equations: AlignmentEquations, gravity: float, tolerance: float, rng: np.random.Generator
 ) -> BoolArray:
     """Which features (J,) are static: those that agree on one motion of the body.
 
     Args:
-        obs: features seen from at least three of the frames.
-        motion: inertial motion between the frames.
-        rig: mounting of the cameras.
+        equations: of features seen from at least three of the frames.
         gravity: its magnitude, m/s².
         tolerance: largest root mean square residual on the plane z = 1.
         rng: draws the samples.
     """
-    model, count, limit = _Model(obs, motion, rig, gravity), len(obs.ids), tolerance**2
+    count, limit = len(equations.obs.ids), tolerance**2
+    model = _Model(equations, gravity)
 
-    def scores(x: FloatArray) -> FloatArray:
-        return np.asarray(np.sum(np.minimum(model.errors(x)[0], limit), axis=1))
+    def scores(errors: FloatArray) -> FloatArray:
+        return np.asarray(np.sum(np.minimum(errors, limit), axis=1))
 
     motions = model.solve(np.vstack([np.ones(count), random_samples(count, rng)]))
     motions = motions[np.isfinite(motions).all(axis=1)]
     if not len(motions):
         return np.ones(count, np.bool_)
-    best = motions[np.argsort(scores(motions), kind="stable")[:_REFINED]]
+    errors, distances = model.errors(motions)
+    chosen = np.argsort(scores(errors), kind="stable")[:_REFINED]
+    best, errors, distances = motions[chosen], errors[chosen], distances[chosen]
     for _ in range(_REFINEMENTS):
-        errors, distances = model.errors(best)
         agree = errors < limit
         better = model.solve(agree / distances)
         known = np.asarray(np.isfinite(better).all(axis=1, keepdims=True))
         best = np.where(known & agree.any(axis=1, keepdims=True), better, best)
-    x = best[[int(np.argmin(scores(best)))]]
-    return np.asarray(np.ravel(model.errors(x)[0]) < limit)
+        errors, distances = model.errors(best)
+    return np.asarray(errors[int(np.argmin(scores(errors)))] < limit)
