@@ -16,10 +16,10 @@ from slam_graph.arrays import FloatArray
 from slam_graph.backend.cost.reprojection import RigProjection
 from slam_graph.backend.initialization.gyroscope_bias import BearingPairs, _pairs, _Planes
 from slam_graph.backend.initialization.inertial_motion import Intervals
-from slam_graph.backend.initialization.start_consensus import constrained_solutions
 from slam_graph.backend.initialization.visual_inertial_alignment import constrained_solution
 from slam_graph.config import load_config
 from slam_graph.datasets import dataset_from_arrays
+from slam_graph.kernels.secular import constrained_solutions
 from slam_graph.pipeline.run_recording import run
 from slam_graph.results.run_result import RunResult
 from slam_graph.sensors.measurements import FeatureFrame, ImuData
@@ -136,7 +136,8 @@ def test_many_constrained_problems_are_solved_as_one_is() -> None:
     rows = rng.normal(size=(50, 30, 7)) * [1.0, 1.0, 1.0, 0.5, 0.5, 0.3, 10.0]
     rows[:25, :, 6] = rows[:25, :, :6] @ [1.0, -2.0, 0.5, 0.0, 0.0, -9.81]
     rows[:25, :, 6] += 0.1 * rng.normal(size=(25, 30))
-    many = constrained_solutions(rows.transpose(0, 2, 1) @ rows, 9.81)
+    many = np.empty((50, 6))
+    constrained_solutions(rows.transpose(0, 2, 1) @ rows, 9.81, 1e-13, 12, many)
     for problem, found in zip(rows, many, strict=True):
         one = constrained_solution(problem[:, :6], problem[:, 6], 9.81)
         np.testing.assert_allclose(found, [*one.velocity, *one.gravity], atol=1e-5)

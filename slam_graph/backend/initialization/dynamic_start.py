@@ -9,6 +9,7 @@ scale in closed form. The engine refines the guess (see dynamic_refinement.py).
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import gtsam
 import numpy as np
@@ -35,7 +36,7 @@ OUTLIER_SIGMAS = 3.0
 """Features with a larger root mean square reprojection error are outliers, in units of σ."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class StartFrames:
     """The frames from which a start in motion is computed.
 
@@ -62,8 +63,9 @@ class StartFrames:
         ends = zip(self.stamps_ns[:-1], self.stamps_ns[1:], strict=True)
         return [imu.between(a, b) for a, b in ends]
 
+    @cached_property
     def tracks(self) -> FeatureTracks:
-        """The observations of all frames, numbered from 0."""
+        """The observations of all frames, numbered from 0; guess and refinement only read them."""
         window = FeatureTracks()
         for k, frame in enumerate(self.frames):
             window.add(k, frame)
@@ -100,7 +102,7 @@ def guess_states(
         rng: draws the samples of RANSAC.
     """
     intervals = Intervals(frames.imu_between(imu))
-    tracks = frames.tracks()
+    tracks = frames.tracks
     ids, lengths = tracks.lengths()
     ids = ids[lengths >= max(3, len(frames.frames) // 3)]
     if len(ids) < MIN_FEATURES:

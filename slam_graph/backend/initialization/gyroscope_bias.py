@@ -95,7 +95,7 @@ class BearingPairs:
         ends = np.append(0, rows.cumsum())[np.append(0, self.counts.cumsum())]
         return BearingPairs(self.interval, np.diff(ends), self.ids[rows], self.products[rows])
 
-    def moments(self) -> tuple[NDArray[np.intp], FloatArray, FloatArray]:
+    def moments(self) -> tuple[NDArray[np.intp], FloatArray, IntArray]:
         """Of the P pairs with enough: interval (P,), Σ (f₁ ⊗ f₂)(f₁ ⊗ f₂)ᵀ, counts (P,)."""
         enough = self.counts >= _MIN_COMMON
         ends = self.counts.cumsum()
@@ -252,8 +252,8 @@ def _pairs(common: BearingPairs, intervals: Intervals, bias: FloatArray) -> _Pai
         return None
     rotations, derivatives = intervals.rotations(bias)
     R, by_bias = rotations[interval], derivatives[interval]
-    roots = np.linalg.cholesky(_noise(moments, R, counts))
-    whitening = np.asarray(np.linalg.inv(roots), np.float64)
+    noise = np.array(_noise(moments, R, counts))
+    whitening = np.asarray(np.linalg.inv(np.linalg.cholesky(noise)), np.float64)
     return _Pairs(interval, moments, R, by_bias, whitening)
 
 

@@ -9,7 +9,8 @@ together with the measured specific force. So RANSAC (Fischler & Bolles 1981, wi
 features are dynamic. An object in uniform motion is an inertial frame like any other: against it
 the larger group wins.
 
-All samples are solved together, by the normal equations of each feature, which are computed once.
+All samples are solved together, by the normal equations of each feature, which are computed once:
+good enough for samples. `constrained_solution` is for the final motion.
 """
 
 from __future__ import annotations
@@ -19,9 +20,10 @@ import numpy as np
 from slam_graph.arrays import BoolArray, FloatArray
 from slam_graph.backend.initialization.visual_inertial_alignment import (
     MIN_DEPTH_M,
+    NEWTON_STEPS,
     AlignmentEquations,
-    secular_multipliers,
 )
+from slam_graph.kernels.secular import constrained_solutions
 
 _SAMPLES = 100
 """If half of the features are static, one sample of four has only such with a probability of
@@ -71,12 +73,14 @@ class _Model:
         away[:, :, 3:6] -= 0.5 * mean(t**2)[:, None, None] * np.eye(3)
         for axis, column in enumerate(motion.displacements[obs.frame].T):
             away[:, axis, 6] += mean(column)
-        self._away = np.ascontiguousarray(away.reshape(-1, 7).T)  # (7, 3 J)
+        self._away = np.ascontiguousarray(away.transpose(1, 2, 0))  # (3, 7, J)
 
     def solve(self, weights: FloatArray) -> FloatArray:
         """Motions (S, 6) from features weighted by (S, J); not finite where undetermined."""
         M = (weights**2 @ self._squares).reshape(-1, 7, 7)
-        return constrained_solutions(M, self._gravity)
+        x = np.empty((len(M), 6))
+        constrained_solutions(M, self._gravity, _RIDGE, NEWTON_STEPS, x)
+        return x
 
     def errors(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
         """What the features say of motions x (S, 6).
@@ -88,8 +92,8 @@ class _Model:
         y = np.column_stack([x, -np.ones(len(x))])  # with the factor of the right-hand side
         squares = (y[:, :, None] * y[:, None, :]).reshape(-1, 49) @ self._squares.T
         away = y @ self._away
-        distances = np.sqrt(np.add.reduce((away * away).reshape(len(x), -1, 3), axis=2))
-        distances = np.maximum(distances, MIN_DEPTH_M)
+        away *= away
+        distances = np.maximum(np.sqrt(away[0] + away[1] + away[2]), MIN_DEPTH_M)
         return np.maximum(squares, 0.0) / self._dof / distances**2, distances
 
 
@@ -123,31 +127,6 @@ def _normal_equations(equations: AlignmentEquations) -> FloatArray:
         H[:, 9, 3 * i : 3 * i + 3] = H[:, 3 * i : 3 * i + 3, 9]
     H[:, 9, 9] = S[:, 0, 3, 3]
     return H
-
-
-def constrained_solutions(M: FloatArray, gravity: float) -> FloatArray:
-    """Velocity and gravity (S, 6) of least squares under |g| = gravity, for many problems at once.
-
-    The velocity is eliminated; for gravity it is a secular equation in the Lagrange multiplier.
-    Normal equations are good enough for samples; `constrained_solution` is for the final one.
-
-    Args:
-        M: (S, 7, 7) normal equations of velocity, gravity and right-hand side.
-        gravity: its magnitude, m/s².
-    """
-    size = np.einsum("sii->s", M[:, :6, :6])[:, None, None] + 1e-300
-    of_v = M[:, :3, :3] + _RIDGE * size * np.eye(3)
-    with np.errstate(all="ignore"):
-        by_g = np.linalg.solve(of_v, M[:, :3, 3:])
-        rest = M[:, 3:6, 3:] - M[:, 3:6, :3] @ by_g
-        of_g = np.where(np.isfinite(rest[:, :, :3]), rest[:, :, :3], 0.0)
-        values, vectors = np.linalg.eigh(of_g)
-        projected = np.einsum("sji,sj->si", vectors, rest[:, :, 3])
-        g = projected / (values + secular_multipliers(values, projected, gravity))
-        g *= gravity / np.linalg.norm(g, axis=1, keepdims=True)
-        g = np.einsum("sij,sj->si", vectors, g)
-        v = by_g[:, :, 3] - np.einsum("sij,sj->si", by_g[:, :, :3], g)
-    return np.concatenate([v, g], axis=1)
 
 
 def random_samples(count: int, rng: np.random.Generator) -> FloatArray:

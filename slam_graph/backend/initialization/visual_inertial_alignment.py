@@ -30,7 +30,7 @@ _REWEIGHTINGS = 2
 """How often the equations are weighted again by the inverse depths of their solution."""
 MIN_DEPTH_M = 0.1
 """Depths are at least this, so that weights stay finite."""
-_NEWTON_STEPS = 12
+NEWTON_STEPS = 12
 """Most steps to the Lagrange multiplier; each doubles its digits, and the first ones are good."""
 
 
@@ -222,5 +222,5 @@ def secular_multipliers(values: FloatArray, projected: FloatArray, gravity: floa
         gravity: its magnitude, m/s².
     """
     multipliers = -values[:, 0] + 1e-12 * np.maximum(values[:, 2], 1e-12)
-    secular_roots(values, projected, gravity, _NEWTON_STEPS, multipliers)
+    secular_roots(values, projected, gravity, NEWTON_STEPS, multipliers)
     return np.asarray(multipliers[:, None])
