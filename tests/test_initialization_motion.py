@@ -11,7 +11,7 @@ from scipy.stats import chi2
 
 from slam_graph.arrays import FloatArray
 from slam_graph.backend.backend_config import BackendConfig, InitializationConfig, NoiseConfig
-from slam_graph.backend.cost.feature_tracks import FeatureTracks
+from slam_graph.backend.cost.feature_tracks import FeatureTracks, Observations
 from slam_graph.backend.cost.reprojection import RigProjection
 from slam_graph.backend.estimator import Estimator
 from slam_graph.backend.initialization.batch_cost import BatchCost
@@ -20,16 +20,21 @@ from slam_graph.backend.initialization.dynamic_start import (
     StartGuess,
     guess_states,
 )
-from slam_graph.backend.initialization.gyroscope_bias import estimate_gyro_bias
+from slam_graph.backend.initialization.gyroscope_bias import BearingPairs, estimate_gyro_bias
 from slam_graph.backend.initialization.inertial_motion import Intervals, Motion
 from slam_graph.backend.initialization.initializer import FRAME_SPACING_S
 from slam_graph.backend.initialization.start_consensus import random_samples, static_features
 from slam_graph.backend.initialization.start_diagnosis import Refusal
-from slam_graph.backend.initialization.visual_inertial_alignment import align
+from slam_graph.backend.initialization.visual_inertial_alignment import (
+    AlignmentEquations,
+    Sightings,
+    align,
+)
 from slam_graph.config import load_config
 from slam_graph.datasets.dataset_registry import open_dataset
 from slam_graph.frontend.frontend_protocol import build_frontend
 from slam_graph.geometry.trajectory import NavState, Trajectory, interpolate
+from slam_graph.sensors import Rig
 from slam_graph.sensors.imu_buffer import ImuBuffer
 from slam_graph.sensors.measurements import CameraFrame, FeatureFrame, FeatureObservations
 
@@ -51,13 +56,18 @@ def exact_motion(flight: Flight, times_s: FloatArray) -> Motion:
     )
 
 
+def equations_of(obs: Observations, motion: Motion, mounted: Rig) -> AlignmentEquations:
+    """The equations of the alignment for one motion."""
+    return Sightings(obs, RigProjection(mounted)).equations(motion)
+
+
 @pytest.mark.parametrize("cameras", [1, 2])
 @pytest.mark.parametrize("start_s", [0.0, 1.0, 7.0])
 def test_alignment_is_exact_without_noise(cameras: int, start_s: float) -> None:
     flight, mounted, times = Flight(), rig(cameras), start_s + TIMES
     obs, _ = scene(flight, mounted, room(200, np.random.default_rng(0)), times, min_frames=4)
     motion = exact_motion(flight, times)
-    found = align(obs, motion, RigProjection(mounted), 9.81)
+    found = align(equations_of(obs, motion, mounted), 9.81)
     assert found is not None
     first = flight.rotation(times[:1]).inv()
     np.testing.assert_allclose(
@@ -73,7 +83,7 @@ def test_alignment_is_exact_without_noise(cameras: int, start_s: float) -> None:
 def test_alignment_bears_pixel_noise(cameras: int) -> None:
     rng, flight, mounted = np.random.default_rng(1), Flight(), rig(cameras)
     obs, _ = scene(flight, mounted, room(300, rng), TIMES, rng, 0.5, min_frames=4)
-    found = align(obs, exact_motion(flight, TIMES), RigProjection(mounted), 9.81)
+    found = align(equations_of(obs, exact_motion(flight, TIMES), mounted), 9.81)
     assert found is not None
     first = flight.rotation(TIMES[:1]).inv()
     velocity = first.apply(flight.velocities(TIMES[:1]))[0]
@@ -104,7 +114,7 @@ def test_the_imu_tells_the_static_world_from_an_object(cameras: int, dynamic: in
     ids, lengths = window.lengths()
     obs = window.observations(ids[lengths >= 4])
     motion = exact_motion(flight, TIMES)
-    static = static_features(obs, motion, RigProjection(mounted), 9.81, 3.0 / 458.0, rng)
+    static = static_features(equations_of(obs, motion, mounted), 9.81, 3.0 / 458.0, rng)
     true = obs.ids < len(still)
     assert (np.sum(~true) > np.sum(true)) == (dynamic > 100)
     assert np.mean(static[true]) > 0.95
@@ -154,7 +164,8 @@ def test_gyro_bias_from_images(cameras: int, seed: int) -> None:
     for noise, tolerance in ((None, 1e-4), (rng, 5e-3)):
         window, imu = window_of(flight, points, cameras, noise)
         intervals = Intervals(window.imu_between(imu))
-        found = estimate_gyro_bias(window.frames, intervals, RigProjection(rig(cameras)))
+        pairs = BearingPairs.between(window.frames, RigProjection(rig(cameras)))
+        found = estimate_gyro_bias(pairs, intervals)
         assert found is not None
         np.testing.assert_allclose(found, bias, atol=tolerance)
 
@@ -163,7 +174,8 @@ def test_gyro_bias_needs_features_in_common() -> None:
     rng = np.random.default_rng(0)
     window, imu = window_of(Flight(), room(6, rng), 1, rng)
     intervals = Intervals(window.imu_between(imu))
-    assert estimate_gyro_bias(window.frames, intervals, RigProjection(rig())) is None
+    pairs = BearingPairs.between(window.frames, RigProjection(rig()))
+    assert estimate_gyro_bias(pairs, intervals) is None
 
 
 @pytest.mark.parametrize("cameras", [1, 2])

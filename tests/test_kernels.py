@@ -52,7 +52,12 @@ from slam_graph.kernels.projection import (
     to_cameras_numpy,
 )
 from slam_graph.kernels.ray_triangulation import triangulate_rays, triangulate_rays_numpy
-from slam_graph.kernels.secular import secular_roots, secular_roots_numpy
+from slam_graph.kernels.secular import (
+    constrained_solutions,
+    constrained_solutions_numpy,
+    secular_roots,
+    secular_roots_numpy,
+)
 from slam_graph.kernels.state_rows import fill_state_rows, fill_state_rows_numpy
 from slam_graph.kernels.track_motion import motion_steps, motion_steps_numpy
 from slam_graph.sensors import Camera
@@ -374,6 +379,20 @@ def test_undistort_radtan() -> None:
     q = model.distort(m, coefficients)[0]
     assert same(model.undistort(q, coefficients), m)
     assert same(CameraModel._newton(model, q, coefficients, q, 20), m)
+
+
+def test_constrained_solutions() -> None:
+    rng = np.random.default_rng(0)
+    rows = rng.normal(size=(101, 30, 7)) * [1.0, 1.0, 1.0, 0.5, 0.5, 0.3, 10.0]
+    M = rows.transpose(0, 2, 1) @ rows
+    found, expected = np.empty((2, len(M), 6))
+    constrained_solutions(M.copy(), 9.81, 1e-13, 12, found)
+    constrained_solutions_numpy(M, 9.81, 1e-13, 12, expected)
+    np.testing.assert_allclose(found, expected, atol=1e-12 * np.abs(expected).max())
+    M[0], M[1] = 0.0, np.nan
+    constrained_solutions(M, 9.81, 1e-13, 12, found)
+    assert np.isnan(found[:2]).all()
+    assert np.isfinite(found[2:]).all()
 
 
 def test_secular_roots() -> None:

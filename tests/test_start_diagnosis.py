@@ -14,12 +14,12 @@ from scipy.spatial.transform import Rotation
 
 from slam_graph.arrays import FloatArray
 from slam_graph.backend.cost.reprojection import RigProjection
-from slam_graph.backend.initialization.gyroscope_bias import _pairs, _Planes
+from slam_graph.backend.initialization.gyroscope_bias import BearingPairs, _pairs, _Planes
 from slam_graph.backend.initialization.inertial_motion import Intervals
-from slam_graph.backend.initialization.start_consensus import constrained_solutions
 from slam_graph.backend.initialization.visual_inertial_alignment import constrained_solution
 from slam_graph.config import load_config
 from slam_graph.datasets import dataset_from_arrays
+from slam_graph.kernels.secular import constrained_solutions
 from slam_graph.pipeline.run_recording import run
 from slam_graph.results.run_result import RunResult
 from slam_graph.sensors.measurements import FeatureFrame, ImuData
@@ -136,7 +136,8 @@ def test_many_constrained_problems_are_solved_as_one_is() -> None:
     rows = rng.normal(size=(50, 30, 7)) * [1.0, 1.0, 1.0, 0.5, 0.5, 0.3, 10.0]
     rows[:25, :, 6] = rows[:25, :, :6] @ [1.0, -2.0, 0.5, 0.0, 0.0, -9.81]
     rows[:25, :, 6] += 0.1 * rng.normal(size=(25, 30))
-    many = constrained_solutions(rows.transpose(0, 2, 1) @ rows, 9.81)
+    many = np.empty((50, 6))
+    constrained_solutions(rows.transpose(0, 2, 1) @ rows, 9.81, 1e-13, 12, many)
     for problem, found in zip(rows, many, strict=True):
         one = constrained_solution(problem[:, :6], problem[:, 6], 9.81)
         np.testing.assert_allclose(found, [*one.velocity, *one.gravity], atol=1e-5)
@@ -148,10 +149,11 @@ def test_the_derivative_by_the_gyroscope_bias() -> None:
     points = room(300, rng)
     frames = [features(flight, mounted, points, t_s, rng) for t_s in times_s]
     samples = [flight.imu(a, b) for a, b in pairwise(times_s)]
-    pairs = _pairs(frames, Intervals(samples), RigProjection(mounted), np.full(3, 0.02))
+    common = BearingPairs.between(frames, RigProjection(mounted))
+    pairs = _pairs(common, Intervals(samples), np.full(3, 0.02))
     assert pairs is not None
     step, axes = 1e-4, np.eye(3)
-    weights = rng.uniform(0.5, 1.0, (len(pairs.interval), 1))
+    weights = rng.uniform(0.5, 1.0, len(pairs.interval))
 
     def half_squares(change: FloatArray) -> FloatArray:
         return 0.5 * _Planes(change, pairs).squares
@@ -159,10 +161,12 @@ def test_the_derivative_by_the_gyroscope_bias() -> None:
     gradients, hessian, _ = _Planes(np.zeros(3), pairs).derivatives(weights)
     slopes = [(half_squares(step * e) - half_squares(-step * e)) / (2.0 * step) for e in axes]
     scale = np.abs(slopes).max()
-    np.testing.assert_allclose(gradients, weights * np.column_stack(slopes), atol=1e-5 * scale)
+    np.testing.assert_allclose(
+        gradients, weights[:, None] * np.column_stack(slopes), atol=1e-5 * scale
+    )
 
     def total(i: int, j: int) -> float:
-        return float(weights[:, 0] @ half_squares(step * (i * axes[a] + j * axes[b])))
+        return float(weights @ half_squares(step * (i * axes[a] + j * axes[b])))
 
     for a, b in product(range(3), repeat=2):
         bend = (total(1, 1) - total(1, -1) - total(-1, 1) + total(-1, -1)) / (4.0 * step**2)

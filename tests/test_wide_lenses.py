@@ -18,7 +18,7 @@ from slam_graph.backend.cost.feature_tracks import Observations
 from slam_graph.backend.cost.reprojection import Geometry, RigProjection
 from slam_graph.backend.cost.triangulation import triangulate
 from slam_graph.backend.initialization.inertial_motion import Motion
-from slam_graph.backend.initialization.visual_inertial_alignment import align
+from slam_graph.backend.initialization.visual_inertial_alignment import Sightings, align
 from slam_graph.datasets.calibration.kalibr_calibration import write_kalibr
 from slam_graph.frontend.epipolar_test import (
     EpipolarTest,
@@ -239,7 +239,7 @@ def test_weights_make_the_start_better(camera: Camera) -> None:
         obs = obs.subset(obs.counts >= 3)
         for weighted in (True, False):
             projection.wide = weighted
-            found = align(obs, motion, projection, 9.81)
+            found = align(Sightings(obs, projection).equations(motion), 9.81)
             assert found is not None
             errors.append(np.linalg.norm(found.velocity - v @ first))
     weighted, plain = np.mean(errors[::2]), np.mean(errors[1::2])

@@ -69,8 +69,9 @@ def gate_by_consensus(
         second = _second_gate(cost, linear, predicted, consensus, tested)
     except np.linalg.LinAlgError:  # they do not determine the step
         return cost.gate(linear, predicted, tested)
-    tracks = consensus.tracks | second.tracks
-    admitted = consensus.landmarks | second.landmarks, tracks if tested is None else tracks[tested]
+    landmarks, tracks = consensus.landmarks.copy(), consensus.tracks | second.tracks
+    landmarks[~landmarks] = second.landmarks
+    admitted = landmarks, tracks if tested is None else tracks[tested]
     return cost.gate(linear, predicted, tested, admitted=admitted)
 
 
@@ -81,13 +82,21 @@ def _second_gate(
     consensus: _Consensus,
     tested: BoolArray | None,
 ) -> Gate:
-    """The gate against what is known once the consensus has updated the prediction."""
+    """The gate of all others against what is known with the consensus.
+
+    Returns:
+        Of the observations of features of the state only those that are not of the consensus.
+    """
     posterior = predicted
     for rows in _rows(cost, linear, predicted, consensus):
         posterior = posterior.updated(rows)
-    moved = posterior.solution()
-    after = _after(cost, linear, moved, predicted)
-    return cost.gate(after, posterior, tested, _CONFIDENCE)
+    others = replace(cost)
+    if linear.landmarks is not None and cost.landmarks is not None:
+        others.landmarks = cost.landmarks.rows(~consensus.landmarks)
+        linear = replace(linear, landmarks=linear.landmarks.subset(~consensus.landmarks))
+    after = _after(others, linear, posterior.solution(), predicted)
+    new = ~consensus.tracks if tested is None else tested & ~consensus.tracks
+    return others.gate(after, posterior, new, _CONFIDENCE)
 
 
 def _consensus(cost: Cost, linear: Linearization) -> _Consensus | None:

@@ -316,7 +316,7 @@ def prior_factors(first: NavState) -> list[gtsam.NonlinearFactor]:
 
 def _lasting(frames: StartFrames) -> Observations:
     """Observations of the features that at least three frames see."""
-    tracks = frames.tracks()
+    tracks = frames.tracks
     ids, lengths = tracks.lengths()
     return tracks.observations(ids[lengths >= 3])
 

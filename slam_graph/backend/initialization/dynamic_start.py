@@ -9,6 +9,7 @@ scale in closed form. The engine refines the guess (see dynamic_refinement.py).
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import gtsam
 import numpy as np
@@ -18,12 +19,14 @@ from slam_graph.backend.backend_config import NoiseConfig
 from slam_graph.backend.cost.feature_tracks import FeatureTracks
 from slam_graph.backend.cost.reprojection import RigProjection
 from slam_graph.backend.initialization.first_state import level_rotation
-from slam_graph.backend.initialization.gyroscope_bias import estimate_gyro_bias
+from slam_graph.backend.initialization.gyroscope_bias import BearingPairs, estimate_gyro_bias
 from slam_graph.backend.initialization.inertial_motion import Intervals, Motion
 from slam_graph.backend.initialization.start_consensus import static_features
 from slam_graph.backend.initialization.start_diagnosis import MIN_FEATURES, Refusal
 from slam_graph.backend.initialization.visual_inertial_alignment import (
     Alignment,
+    AlignmentEquations,
+    Sightings,
     align,
 )
 from slam_graph.geometry import NavState
@@ -33,7 +36,7 @@ OUTLIER_SIGMAS = 3.0
 """Features with a larger root mean square reprojection error are outliers, in units of σ."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class StartFrames:
     """The frames from which a start in motion is computed.
 
@@ -60,12 +63,9 @@ class StartFrames:
         ends = zip(self.stamps_ns[:-1], self.stamps_ns[1:], strict=True)
         return [imu.between(a, b) for a, b in ends]
 
-    def only(self, ids: IntArray) -> StartFrames:
-        """The same frames with only some features (N,)."""
-        return StartFrames(self.stamps_ns, [frame.only(ids) for frame in self.frames])
-
+    @cached_property
     def tracks(self) -> FeatureTracks:
-        """The observations of all frames, numbered from 0."""
+        """The observations of all frames, numbered from 0; guess and refinement only read them."""
         window = FeatureTracks()
         for k, frame in enumerate(self.frames):
             window.add(k, frame)
@@ -102,39 +102,39 @@ def guess_states(
         rng: draws the samples of RANSAC.
     """
     intervals = Intervals(frames.imu_between(imu))
-    tracks = frames.tracks()
+    tracks = frames.tracks
     ids, lengths = tracks.lengths()
     ids = ids[lengths >= max(3, len(frames.frames) // 3)]
     if len(ids) < MIN_FEATURES:
         return Refusal("tracks", f"more features with long tracks ({len(ids)} so far)")
-    obs = tracks.observations(ids)
+    sightings = Sightings(tracks.observations(ids), rig)
     tolerance = OUTLIER_SIGMAS * config.pixel_sigma / rig.cameras[0].fx
 
     def consensus(
-        seen: StartFrames, near: FloatArray
-    ) -> tuple[FloatArray, Motion, BoolArray] | None:
-        """Gyroscope bias by some features, the motion that it gives, and the static features."""
-        gyro_bias = estimate_gyro_bias(seen.frames, intervals, rig, near)
+        common: BearingPairs, near: FloatArray
+    ) -> tuple[FloatArray, AlignmentEquations, BoolArray] | None:
+        """Gyroscope bias by some features, the equations with it, and the static features."""
+        gyro_bias = estimate_gyro_bias(common, intervals, near)
         if gyro_bias is None:
             return None
-        motion = intervals.motion(gyro_bias)
-        static = static_features(obs, motion, rig, config.gravity, tolerance, rng)
-        return gyro_bias, motion, static
+        equations = sightings.equations(intervals.motion(gyro_bias))
+        return gyro_bias, equations, static_features(equations, config.gravity, tolerance, rng)
 
-    found = consensus(frames, np.zeros(3))
+    common = BearingPairs.between(frames.frames, rig)
+    found = consensus(common, np.zeros(3))
     if found is not None and not found[2].all():
         # dynamic features have biased the gyroscope bias, and with it the consensus
-        found = consensus(frames.only(ids[found[2]]), found[0])
+        found = consensus(common.only(ids[found[2]]), found[0])
     if found is None:
         return Refusal("tracks", "features in common between frames")
-    gyro_bias, motion, static = found
+    gyro_bias, equations, static = found
     if np.sum(static) < MIN_FEATURES:
         agree = f"{np.sum(static)} of {len(ids)} do"
         return Refusal("fit", f"features that agree on a motion ({agree})")
-    alignment = align(obs.subset(static), motion, rig, config.gravity)
+    alignment = align(equations.subset(static), config.gravity)
     if alignment is None:
         return Refusal("motion", "motion that determines gravity and scale")
-    return StartGuess(_states(frames, motion, alignment, gyro_bias), ids[static])
+    return StartGuess(_states(frames, equations.motion, alignment, gyro_bias), ids[static])
 
 
 def _states(

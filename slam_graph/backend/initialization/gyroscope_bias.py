@@ -25,12 +25,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from slam_graph.arrays import FloatArray, skew
+from slam_graph.arrays import FloatArray, IntArray, skew
+from slam_graph.backend.cost.feature_tracks import is_in
 from slam_graph.backend.cost.reprojection import RigProjection
 from slam_graph.backend.cost.robust_loss import RobustLoss
 from slam_graph.backend.initialization.inertial_motion import Intervals
 from slam_graph.backend.solve.damped_steps import Attempt, TenfoldDamping, levenberg_marquardt
-from slam_graph.sensors import FeatureFrame, FeatureObservations
+from slam_graph.sensors import FeatureFrame
 
 _MIN_COMMON = 8
 """Pairs of frames with fewer common features than this are left out."""
@@ -41,10 +42,66 @@ _ROUNDS, _LINEAR_RAD_S = 2, 1e-3
 _MAX_STEPS, _CONVERGED = 30, 1e-6
 """Most steps of each time, and the relative change of the cost at which they end: a thousandth of
 the bias's noise."""
+
+
 _TINY = 1e-12
 """Keeps divisions finite."""
-_CROSS = skew(np.eye(3))
-"""(3, 3, 3) the matrices [e_a]ₓ of the cross products with the axes."""
+_NORMALS = skew(np.eye(3)).transpose(2, 1, 0)[:, None, :, :, None] * np.eye(3)[:, None, None, :]
+_NORMALS = _NORMALS.reshape(9, 27)
+"""Makes of rotations R, as rows (9,), the products (3, 9) with which n = A(R) (f₁ ⊗ f₂)."""
+_CROSSES = np.kron(np.eye(3), skew(np.eye(3)).reshape(3, 9))
+"""Makes of products y (9,) those (9, 3) by which a turn of the second body changes them."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BearingPairs:
+    """Features that two frames in a row have in common, of Q pairs of frames of a camera.
+
+    Attributes:
+        interval: (Q,) which two frames each pair is of.
+        counts: (Q,) number of its features.
+        ids: (N,) of the features of all pairs, one pair after the other.
+        products: (N, 9) f₁ ⊗ f₂ of the bearings f in the orientation of the body.
+    """
+
+    interval: NDArray[np.intp]
+    counts: IntArray
+    ids: IntArray
+    products: FloatArray
+
+    @staticmethod
+    def between(frames: list[FeatureFrame], rig: RigProjection) -> BearingPairs:
+        """Those of frames in the order of time."""
+        cameras = range(len(frames[0].cameras))
+        seen = [_seen_by(camera, frames, rig) for camera in cameras]
+        interval, ids, first, second = [], [], [], []
+        for k in range(len(frames) - 1):
+            for camera in cameras:
+                (one, bearings_1), (two, bearings_2) = seen[camera][k : k + 2]
+                places = np.minimum(two.searchsorted(one), max(len(two) - 1, 0))
+                common = two.take(places) == one if len(two) else np.zeros(len(one), np.bool_)
+                interval.append(k)
+                ids.append(one[common])
+                first.append(bearings_1[common])
+                second.append(bearings_2[places[common]])
+        bearings_1, bearings_2 = np.concatenate(first), np.concatenate(second)
+        products = (bearings_1[:, :, None] * bearings_2[:, None, :]).reshape(-1, 9)
+        counts = np.array([len(common) for common in ids])
+        return BearingPairs(np.array(interval), counts, np.concatenate(ids), products)
+
+    def only(self, ids: IntArray) -> BearingPairs:
+        """Those of some features (ascending ids)."""
+        rows = is_in(self.ids, ids)
+        ends = np.append(0, rows.cumsum())[np.append(0, self.counts.cumsum())]
+        return BearingPairs(self.interval, np.diff(ends), self.ids[rows], self.products[rows])
+
+    def moments(self) -> tuple[NDArray[np.intp], FloatArray, IntArray]:
+        """Of the P pairs with enough: interval (P,), Σ (f₁ ⊗ f₂)(f₁ ⊗ f₂)ᵀ, counts (P,)."""
+        enough = self.counts >= _MIN_COMMON
+        ends = self.counts.cumsum()
+        rows = [self.products[e - n : e] for e, n in zip(ends, self.counts, strict=True)]
+        moments = [part.T @ part for part, good in zip(rows, enough, strict=True) if good]
+        return self.interval[enough], np.array(moments).reshape(-1, 9, 9), self.counts[enough]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -67,21 +124,17 @@ class _Pairs:
 
 
 def estimate_gyro_bias(
-    frames: list[FeatureFrame],
-    intervals: Intervals,
-    rig: RigProjection,
-    near: FloatArray | None = None,
+    common: BearingPairs, intervals: Intervals, near: FloatArray | None = None
 ) -> FloatArray | None:
     """The constant gyroscope bias (3,) rad/s over some frames, None without enough features.
 
     Args:
-        frames: in the order of time.
+        common: features in common between the frames.
         intervals: IMU samples between each frame and the next.
-        rig: mounting of the cameras.
         near: (3,) a bias to begin with; zero if not given.
     """
     bias = np.zeros(3) if near is None else near
-    pairs = _pairs(frames, intervals, rig, bias)
+    pairs = _pairs(common, intervals, bias)
     if pairs is None:
         return None
     for _ in range(_ROUNDS):  # the rotation is linearised in the bias: once more at the solution
@@ -120,7 +173,7 @@ class _BiasProblem:
 
     def linearize(self) -> None:
         """Gradient and Hessian with the weights of the loss."""
-        weights = self._loss.weights(self._planes.distances)[:, None]
+        weights = self._loss.weights(self._planes.distances)
         gradients, self._hessian, self._scale = self._planes.derivatives(weights)
         self._gradient = gradients.sum(axis=0)
 
@@ -156,10 +209,11 @@ class _Planes:
     def __init__(self, change: FloatArray, pairs: _Pairs) -> None:
         R = pairs.R @ Rotation.from_rotvec(pairs.by_bias @ change).as_matrix()
         # n = Σ f₁ₐ [eₐ]ₓ R f₂
-        of_products = (_CROSS @ R[:, None]).transpose(0, 2, 1, 3).reshape(-1, 3, 9)
-        white = pairs.whitening @ of_products
-        self._values, vectors = np.linalg.eigh(white @ pairs.moments @ white.transpose(0, 2, 1))
-        self._pairs, self._along = pairs, vectors.transpose(0, 2, 1) @ white
+        white = pairs.whitening @ (R.reshape(-1, 9) @ _NORMALS).reshape(-1, 3, 9)
+        self._values, self._vectors = np.linalg.eigh(
+            white @ pairs.moments @ white.transpose(0, 2, 1)
+        )
+        self._pairs, self._white = pairs, white
         self.squares = np.maximum(self._values[:, 0], 0.0)
         self.distances = np.sqrt(self.squares)
 
@@ -171,75 +225,69 @@ class _Planes:
         the plane, whose own change counts in the second order.
 
         Args:
-            weights: (P, 1) of the pairs.
+            weights: (P,) of the pairs.
 
         Returns:
             Gradients (P, 3), the Hessian (3, 3), and the scales (3,) of its damping.
         """
-        K, J, y = self._pairs.moments, self._pairs.by_bias, self._along
-        by_turn = skew(y.reshape(-1, 3)).reshape(-1, 3, 9, 3)
-        Ky = y @ K
-        moved = by_turn.transpose(0, 1, 3, 2) @ Ky[:, 0, None, :, None]
-        moved = moved[..., 0] + Ky @ by_turn[:, 0]  # (P, 3, 3): of y·Ky, y₁·Ky and y₂·Ky
-        first = by_turn[:, 0].transpose(0, 2, 1) @ K @ by_turn[:, 0]
-        outer = Ky[:, 0].reshape(-1, 3, 3).transpose(0, 2, 1) @ y[:, 0].reshape(-1, 3, 3)
-        second = 0.5 * (outer + outer.transpose(0, 2, 1)) - self.squares[:, None, None] * np.eye(3)
+        K, J, y = self._pairs.moments, self._pairs.by_bias, self._vectors.mT @ self._white
+        by_turn = (y @ _CROSSES).reshape(-1, 3, 9, 3)
+        Ky, by_first = y @ K, by_turn[:, 0]
+        # (P, 3, 3): of y·Ky, y₁·Ky and y₂·Ky
+        moved = (Ky[:, :1, None] @ by_turn)[:, :, 0] + Ky @ by_first
+        first = by_first.mT @ (K @ by_first)
+        outer = Ky[:, 0].reshape(-1, 3, 3).mT @ y[:, 0].reshape(-1, 3, 3)
+        second = first + 0.5 * (outer + outer.mT) - self.squares[:, None, None] * np.eye(3)
         gaps = np.maximum(self._values[:, 1:] - self._values[:, :1], _TINY)[:, :, None]
-        second -= moved[:, 1:].transpose(0, 2, 1) @ (moved[:, 1:] / gaps)
-        across = J.transpose(0, 2, 1) * weights[:, :, None]
-        gradients = (across @ (0.5 * moved[:, 0, :, None]))[..., 0]
-        convex = np.sum(across @ first @ J, axis=0)
-        return gradients, convex + np.sum(across @ second @ J, axis=0), np.diag(convex)
+        second -= moved[:, 1:].mT @ (moved[:, 1:] / gaps)
+        across = (J * weights[:, None, None]).mT
+        gradients = (moved[:, :1] @ J)[:, 0] * (0.5 * weights[:, None])
+        convex = np.einsum("pik,pki->i", across, first @ J)
+        return gradients, (across @ (second @ J)).sum(axis=0), convex
 
 
-def _pairs(
-    frames: list[FeatureFrame], intervals: Intervals, rig: RigProjection, bias: FloatArray
-) -> _Pairs | None:
-    rotations, derivatives = intervals.rotations(bias)
-    turns = [rig.row_turns(k, frame) for k, frame in enumerate(frames)]
-    which, moments, noise = [], [], []
-    for k, R in enumerate(rotations):
-        before, after = frames[k], frames[k + 1]
-        for camera, (one, two) in enumerate(zip(before.cameras, after.cameras, strict=True)):
-            _, i, j = np.intersect1d(one.ids, two.ids, assume_unique=True, return_indices=True)
-            if len(i) >= _MIN_COMMON:
-                mounting = rig.body_R_camera[camera]
-                first = _bearings(one, i, mounting, turns[k][camera])
-                second = _bearings(two, j, mounting, turns[k + 1][camera])
-                products = (first[:, :, None] * second[:, None, :]).reshape(-1, 9)
-                moments.append(products.T @ products)
-                noise.append(_noise(first, second @ R.T))
-                which.append(k)
-    if not which:
+def _pairs(common: BearingPairs, intervals: Intervals, bias: FloatArray) -> _Pairs | None:
+    interval, moments, counts = common.moments()
+    if not len(interval):
         return None
-    interval = np.array(which)
-    return _Pairs(
-        interval,
-        np.array(moments),
-        rotations[interval],
-        derivatives[interval],
-        np.asarray(np.linalg.inv(np.linalg.cholesky(np.array(noise))), np.float64),
-    )
+    rotations, derivatives = intervals.rotations(bias)
+    R, by_bias = rotations[interval], derivatives[interval]
+    noise = np.array(_noise(moments, R, counts))
+    whitening = np.asarray(np.linalg.inv(np.linalg.cholesky(noise)), np.float64)
+    return _Pairs(interval, moments, R, by_bias, whitening)
 
 
-def _noise(first: FloatArray, turned: FloatArray) -> FloatArray:
-    """The covariance (3, 3) of the noise of the normals of a pair, on average, in σ².
+def _noise(moments: FloatArray, R: FloatArray, counts: IntArray) -> FloatArray:
+    """The covariances (P, 3, 3) of the noise of the normals of pairs, on average, in σ².
 
     Noise σ perpendicular to the bearings adds σ² Σ (I - f₁ f₁ᵀ) + (I - R f₂ (R f₂)ᵀ) to Σ n nᵀ, the
     normals being n = f₁ × R f₂.
 
     Args:
-        first: (N, 3) bearings.
-        turned: (N, 3) R f₂, those of the same features in the second frame.
+        moments: (P, 9, 9) Σ (f₁ ⊗ f₂)(f₁ ⊗ f₂)ᵀ.
+        R: (P, 3, 3) rotation from the second body to the first.
+        counts: (P,) number of features.
     """
-    return np.asarray(
-        2.0 * np.eye(3) - (first.T @ first + turned.T @ turned) / len(first), np.float64
-    )
+    of_both = moments.reshape(-1, 3, 3, 3, 3)  # bearings have the length 1
+    first, second = np.einsum("pabcb->pac", of_both), np.einsum("pabac->pbc", of_both)
+    outer = first + R @ second @ R.mT
+    return np.asarray(2.0 * np.eye(3) - outer / counts[:, None, None], np.float64)
 
 
-def _bearings(
-    obs: FeatureObservations, rows: NDArray[np.intp], R: FloatArray, turns: FloatArray | None
-) -> FloatArray:
-    bearings = np.concatenate([obs.normalized[rows], np.ones((len(rows), 1))], axis=1)
-    unit: FloatArray = (bearings / np.linalg.norm(bearings, axis=1, keepdims=True)) @ R.T
-    return unit if turns is None else np.einsum("nij,nj->ni", turns[rows], unit)
+def _seen_by(
+    camera: int, frames: list[FeatureFrame], rig: RigProjection
+) -> list[tuple[IntArray, FloatArray]]:
+    """Ids (N,), ascending, and bearings (N, 3) in the body, of each frame of a camera."""
+    seen = [frame.cameras[camera] for frame in frames]
+    orders = [obs.ids.argsort() for obs in seen]
+    rays = np.ones((sum(len(obs) for obs in seen), 3))
+    rays[:, :2] = np.concatenate([o.normalized[rows] for o, rows in zip(seen, orders, strict=True)])
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    bearings = np.split(rays @ rig.body_R_camera[camera].T, np.cumsum([len(o) for o in seen])[:-1])
+    if rig.rolling:
+        for k, (frame, rows) in enumerate(zip(frames, orders, strict=True)):
+            turns = rig.row_turns(k, frame)[camera]
+            assert turns is not None
+            bearings[k] = np.einsum("nij,nj->ni", turns[rows], bearings[k])
+    ids = [obs.ids[rows] for obs, rows in zip(seen, orders, strict=True)]
+    return list(zip(ids, bearings, strict=True))

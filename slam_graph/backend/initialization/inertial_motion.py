@@ -42,6 +42,7 @@ class Intervals:
         """Take the samples of each interval; shorter ones get steps of no duration at the end."""
         steps = [block.steps() for block in blocks]
         most = max(len(durations_s) for durations_s, _, _ in steps)
+        self._last: tuple[FloatArray, FloatArray, FloatArray] | None = None
         self._durations_s = np.zeros((most, len(blocks)))
         self._gyro, self._accel = np.zeros((2, most, len(blocks), 3))
         for k, (durations_s, gyro, accel) in enumerate(steps):
@@ -52,21 +53,18 @@ class Intervals:
     def rotations(self, gyro_bias: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Rotations (K, 3, 3) over the intervals, and their derivatives (K, 3, 3) by the bias.
 
-        With R = Π exp(θₛ) and θₛ = (ωₛ - b) dtₛ, the derivative in the tangent at the end follows
-        from step to step (Forster et al. 2017, eq. 35): J ← exp(θₛ)ᵀ J - J_r(θₛ) dtₛ.
+        With R = Π exp(θₛ) and θₛ = (ωₛ - b) dtₛ, the derivative in the tangent at the end is the
+        sum of -J_r(θₛ) dtₛ, turned by all steps that follow (Forster et al. 2017, eq. 35).
 
         Args:
             gyro_bias: (3,) rad/s.
         """
-        turns = self._turns(gyro_bias)
-        steps = _exponentials(turns)
-        half = skew(turns.reshape(-1, 3)).reshape(steps.shape)
+        turns, attitudes = self._integrated(gyro_bias)
+        half = skew(turns)
         right = np.eye(3) - half / 2.0 + half @ half / 6.0  # of steps of some hundredths of a rad
-        by_bias = right * self._durations_s[:, :, None, None]
-        R, J = np.tile(np.eye(3), (len(steps[0]), 1, 1)), np.zeros((len(steps[0]), 3, 3))
-        for step, change in zip(steps, by_bias, strict=True):
-            R, J = R @ step, step.transpose(0, 2, 1) @ J - change
-        return R, J
+        # the turn that follows a step is Rₛ₊₁ᵀ R
+        R, changes = attitudes[-1], attitudes[1:] @ (right * self._durations_s[:, :, None, None])
+        return R, -(R.mT @ changes.sum(axis=0))
 
     def motion(self, gyro_bias: FloatArray) -> Motion:
         """The motion from the first frame to every other.
@@ -74,13 +72,10 @@ class Intervals:
         Args:
             gyro_bias: (3,) rad/s.
         """
-        turns, dt = self._turns(gyro_bias), self._durations_s[:, :, None]
+        (turns, attitudes), dt = self._integrated(gyro_bias), self._durations_s[:, :, None]
         # the specific force is turned by the attitude half a step on
         force = self._accel + 0.5 * np.cross(turns, self._accel)
-        attitudes = [np.tile(np.eye(3), (turns.shape[1], 1, 1))]
-        for step in _exponentials(turns):
-            attitudes.append(attitudes[-1] @ step)
-        gained = (np.array(attitudes[:-1]) @ force[..., None])[..., 0] * dt
+        gained = (attitudes[:-1] @ force[..., None])[..., 0] * dt
         velocity = np.cumsum(gained, axis=0)
         displacement = np.sum((velocity - 0.5 * gained) * dt, axis=0)
         durations_s = self._durations_s.sum(axis=0)
@@ -93,9 +88,19 @@ class Intervals:
             rows.append((rows[-1][0] + duration_s, R, p, v))
         return Motion(*(np.array(column) for column in zip(*rows, strict=True)))
 
-    def _turns(self, gyro_bias: FloatArray) -> FloatArray:
-        """Rotation vectors (S, K, 3) of the steps."""
-        return np.asarray((self._gyro - gyro_bias) * self._durations_s[:, :, None])
+    def _integrated(self, gyro_bias: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Rotation vectors (S, K, 3) of the steps, and attitudes (S + 1, K, 3, 3) before and after.
+
+        Those of the last bias are kept: rotations and the motion are asked for one after the other.
+        """
+        if self._last is None or self._last[0] is not gyro_bias:
+            turns = np.asarray((self._gyro - gyro_bias) * self._durations_s[:, :, None])
+            attitudes = np.empty((len(turns) + 1, turns.shape[1], 3, 3))
+            attitudes[0] = np.eye(3)
+            for s, step in enumerate(_exponentials(turns)):
+                np.matmul(attitudes[s], step, out=attitudes[s + 1])
+            self._last = gyro_bias, turns, attitudes
+        return self._last[1:]
 
 
 def _exponentials(turns: FloatArray) -> FloatArray:

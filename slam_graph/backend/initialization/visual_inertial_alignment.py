@@ -18,7 +18,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from slam_graph.arrays import FloatArray
+from slam_graph.arrays import BoolArray, FloatArray
 from slam_graph.backend.cost.feature_factors import eliminate_points
 from slam_graph.backend.cost.feature_tracks import Observations
 from slam_graph.backend.cost.reprojection import RigProjection
@@ -30,7 +30,7 @@ _REWEIGHTINGS = 2
 """How often the equations are weighted again by the inverse depths of their solution."""
 MIN_DEPTH_M = 0.1
 """Depths are at least this, so that weights stay finite."""
-_NEWTON_STEPS = 12
+NEWTON_STEPS = 12
 """Most steps to the Lagrange multiplier; each doubles its digits, and the first ones are good."""
 
 
@@ -56,25 +56,101 @@ class Alignment:
         return self.velocity + self.gravity * motion.times_s[:, None] + motion.velocities
 
 
-def align(
-    obs: Observations, motion: Motion, rig: RigProjection, gravity: float
-) -> Alignment | None:
+@dataclass(frozen=True, slots=True, eq=False)
+class AlignmentEquations:
+    """The equations of N observations for their features and one motion of the body.
+
+    Attributes:
+        obs: the observations.
+        rig: mounting of the cameras.
+        motion: inertial motion between the frames.
+        times_s: (N,) of the observed rows since the first frame.
+        by_point: (N, 2, 3) coefficients of the position of the feature.
+        b: (N, 2) right-hand sides.
+    """
+
+    obs: Observations
+    rig: RigProjection
+    motion: Motion
+    times_s: FloatArray
+    by_point: FloatArray
+    b: FloatArray
+
+    def subset(self, keep: BoolArray) -> AlignmentEquations:
+        """Those of the features where `keep` (J,) holds."""
+        if keep.all():
+            return self
+        rows = keep[self.obs.feature].nonzero()[0]
+        times_s, by_point, b = self.times_s[rows], self.by_point[rows], self.b[rows]
+        obs = self.obs.subset(keep)
+        return AlignmentEquations(obs, self.rig, self.motion, times_s, by_point, b)
+
+    def without_points(self, weights: FloatArray | None) -> tuple[FloatArray, FloatArray]:
+        """The weighted equations, triangular in the positions of the features.
+
+        Args:
+            weights: (N,) of the observations; all 1 if not given.
+
+        Returns:
+            The coefficients (J, 3, 3) of the positions, and those (J, 2 M, 7) of velocity, gravity
+            and the right-hand side; from the fourth row on they do not contain the feature.
+        """
+        by_point, b, t = self.by_point, self.b, self.times_s[:, None, None]
+        if weights is not None:
+            by_point, b = by_point * weights[:, None, None], b * weights[:, None]
+        others = np.empty((len(b), 2, 7))
+        np.multiply(by_point, -t, out=others[:, :, :3])
+        np.multiply(by_point, -0.5 * t**2, out=others[:, :, 3:6])
+        others[:, :, 6] = b
+        return eliminate_points(self.obs, by_point, others)
+
+
+class Sightings:
+    """What observations say of directions in the body: the same for every motion.
+
+    Attributes:
+        obs: the observations.
+        rig: mounting of the cameras.
+    """
+
+    def __init__(self, obs: Observations, rig: RigProjection) -> None:
+        """Turn the rows (I₂ | -m) of all observations into the body."""
+        self.obs, self.rig = obs, rig
+        body_R_camera, body_p_camera = rig.mounts(obs)
+        rows = np.zeros((len(obs), 2, 3))
+        rows[:, 0, 0] = rows[:, 1, 1] = 1.0
+        rows[:, :, 2] = -obs.normalized
+        if rig.wide:
+            rows = rig.pixel_slopes(obs) @ rows
+        self._rows = rows @ body_R_camera.transpose(0, 2, 1)
+        self._of_cameras = (self._rows @ body_p_camera[:, :, None])[..., 0]
+        self._late_s = rig.row_times_s(obs)  # of the rows of a rolling shutter
+
+    def equations(self, motion: Motion) -> AlignmentEquations:
+        """The equations for one motion."""
+        frame = self.obs.frame
+        by_point = self._rows @ motion.rotations.transpose(0, 2, 1)[frame]
+        displacements = motion.displacements[frame]
+        if self.rig.rolling:
+            displacements = displacements + motion.velocities[frame] * self._late_s[:, None]
+        b = (by_point @ displacements[:, :, None])[..., 0] + self._of_cameras
+        times_s = motion.times_s[frame] + self._late_s
+        return AlignmentEquations(self.obs, self.rig, motion, times_s, by_point, b)
+
+
+def align(equations: AlignmentEquations, gravity: float) -> Alignment | None:
     """Solve for velocity and gravity.
 
     Args:
-        obs: features seen from at least two of the K frames.
-        motion: inertial motion between the frames.
-        rig: mounting of the cameras.
+        equations: of features seen from at least two of the frames.
         gravity: its magnitude, m/s².
 
     Returns:
         None if the equations do not determine a solution.
     """
-    weights = np.ones(len(obs))
+    weights = None
     for rounds_left in reversed(range(1 + _REWEIGHTINGS)):
-        by_point, by_motion, b = alignment_equations(obs, motion, rig, weights)
-        others = np.concatenate([by_motion, b[:, :, None]], axis=2)
-        R, eliminated = eliminate_points(obs, by_point, others)
+        R, eliminated = equations.without_points(weights)
         rest = eliminated[:, 3:].reshape(-1, 7)
         try:
             alignment = constrained_solution(rest[:, :6], rest[:, 6], gravity)
@@ -82,51 +158,22 @@ def align(
             return None
         if not rounds_left:
             break
-        weights = 1.0 / _depths(obs, motion, rig, alignment, (R, eliminated[:, :3]))
+        weights = 1.0 / _depths(equations, alignment, (R, eliminated[:, :3]))
     return alignment
 
 
-def alignment_equations(
-    obs: Observations, motion: Motion, rig: RigProjection, weights: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Coefficients of f (N, 2, 3) and of (v₀, g) (N, 2, 6), and right-hand sides (N, 2)."""
-    body_R_camera, body_p_camera = rig.mounts(obs)
-    camera_R_body = body_R_camera.transpose(0, 2, 1)
-    rows = np.zeros((len(obs), 2, 3))
-    rows[:, 0, 0] = rows[:, 1, 1] = 1.0
-    rows[:, :, 2] = -obs.normalized
-    if rig.wide:
-        rows = rig.pixel_slopes(obs) @ rows
-    in_body = rows @ camera_R_body * weights[:, None, None]
-    by_point = in_body @ motion.rotations[obs.frame].transpose(0, 2, 1)
-    late_s = rig.row_times_s(obs)  # of the rows of a rolling shutter
-    t = (motion.times_s[obs.frame] + late_s)[:, None, None]
-    by_motion = np.concatenate([-by_point * t, -0.5 * by_point * t**2], axis=2)
-    displacements = motion.displacements[obs.frame]
-    if rig.rolling:
-        displacements = displacements + motion.velocities[obs.frame] * late_s[:, None]
-    b = np.einsum("nij,nj->ni", by_point, displacements)
-    b += np.einsum("nij,nj->ni", in_body, body_p_camera)
-    return by_point, by_motion, b
-
-
 def _depths(
-    obs: Observations,
-    motion: Motion,
-    rig: RigProjection,
-    found: Alignment,
-    of_points: tuple[FloatArray, FloatArray],
+    equations: AlignmentEquations, found: Alignment, of_points: tuple[FloatArray, FloatArray]
 ) -> FloatArray:
     """Depths (N,) of the features in their cameras under an alignment.
 
     Args:
-        obs: N observations of J features.
-        motion: inertial motion between the frames.
-        rig: mounting of the cameras.
+        equations: of N observations of J features.
         found: velocity and gravity.
         of_points: the equations for the features: their triangular coefficients (J, 3, 3), and
             those of velocity and gravity with the right-hand side (J, 3, 7).
     """
+    obs, motion, rig = equations.obs, equations.motion, equations.rig
     R, others = of_points
     right = others @ np.concatenate([-found.velocity, -found.gravity, [1.0]])
     points = np.linalg.solve(R + 1e-9 * np.eye(3), right[:, :, None])[:, :, 0]
@@ -175,5 +222,5 @@ def secular_multipliers(values: FloatArray, projected: FloatArray, gravity: floa
         gravity: its magnitude, m/s².
     """
     multipliers = -values[:, 0] + 1e-12 * np.maximum(values[:, 2], 1e-12)
-    secular_roots(values, projected, gravity, _NEWTON_STEPS, multipliers)
+    secular_roots(values, projected, gravity, NEWTON_STEPS, multipliers)
     return np.asarray(multipliers[:, None])
