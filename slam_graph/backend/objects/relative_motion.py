@@ -25,6 +25,7 @@ from slam_graph.backend.backend_config import BackendConfig
 from slam_graph.backend.cost.selection_policies import FEATURE_POLICIES
 from slam_graph.backend.estimator import Estimator
 from slam_graph.backend.objects.ego_motion import EgoMotion
+from slam_graph.backend.objects.object_start import first_state
 from slam_graph.backend.objects.objects_config import ObjectsConfig
 from slam_graph.backend.objects.track_window import TrackWindow
 from slam_graph.backend.policies import AlgorithmConfig
@@ -96,6 +97,8 @@ class RelativeMotion:
             object_settings(backend, config),
             Diagnostics(),
         )
+        self._rig, self._config = rig.without_imu(), config
+        self._prior = backend.initialization.prior
         self._length_ns = round(length_s * 1e9)
         self._offset_ns = round(rig.pose_offset_s * 1e9)
         self._taken_ns = 0  # motion of the platform after this has not been added
@@ -123,6 +126,8 @@ class RelativeMotion:
             EstimationError: if the equations cannot be solved: the object is lost.
         """
         self._add_motion(frame.stamp_ns, ego)
+        if not self.poses and not self._begun(frame, ego):
+            return False
         try:
             state = self._estimator.add_frame(frame)
         except (RuntimeError, np.linalg.LinAlgError) as error:
@@ -142,6 +147,13 @@ class RelativeMotion:
             if i in past:
                 self.poses[stamp] = values.atPose3(X(i))
         return True
+
+    def _begun(self, frame: FeatureFrame, ego: EgoMotion) -> bool:
+        """Begin in a frame, if enough of its features have a depth."""
+        state = first_state(frame, ego, self._rig, self._prior, self._config.min_points)
+        if state is not None:
+            self._estimator.start(state, with_rate=True)
+        return state is not None
 
     def _add_motion(self, now_ns: int, ego: EgoMotion) -> None:
         """Add the motion of the platform since the last frame that was taken."""
