@@ -140,8 +140,7 @@ class Estimator(EstimatorKnowledge):
 
         Args:
             state: with its covariance.
-            with_rate: whether it has, without an IMU, the angular rate as its bias, negative; else
-                the rate is not known.
+            with_rate: whether, without an IMU, its bias is the angular rate, negative.
 
         Raises:
             EstimationError: if the state has no covariance.
