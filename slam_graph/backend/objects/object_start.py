@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""The first state of the platform in the frame of an object: what is known before any motion is seen.
+"""The first state of the platform in the frame of an object, before any motion is seen.
 
 An object has few points close together, so PnP from one frame to the next tells its turn and its
 shift badly, and the two errors together: 2° and 0.2 m within 0.1 s on a box 3.5 m ahead, several
