@@ -21,6 +21,7 @@ def first_frame() -> tuple[FeatureFrame, EgoMotion, Rig]:
     """The first features of a flight, and a platform that flies past them."""
     sequence = simulate(duration_s=1.0, rate_hz=10.0, seed=1, tracks={"pixel_sigma": 0.5})
     frame = next(iter(sequence.frames()))
+    assert isinstance(frame, FeatureFrame)
     pose = gtsam.Pose3(gtsam.Rot3.RzRyRx(0.3, -0.2, 1.0), np.array([5.0, -2.0, 1.0]))
     velocity = np.array([1.0, 0.5, 0.0])
     none = np.zeros(3)
