@@ -135,18 +135,19 @@ class Estimator(EstimatorKnowledge):
 
     # --- input -----------------------------------------------------------------------------------
 
-    def start(self, state: NavState) -> None:
+    def start(self, state: NavState, with_rate: bool = False) -> None:
         """Begin from a known state.
 
         Args:
             state: with its covariance.
+            with_rate: whether, without an IMU, its bias is the angular rate, negative.
 
         Raises:
             EstimationError: if the state has no covariance.
         """
         if state.covariance is None:
             raise EstimationError("a start state needs a covariance")
-        state = self._given = self._dynamics.given(state)
+        state = self._given = state if with_rate else self._dynamics.given(state)
         self._start_up.doubtful = False
         self._context.propagation.restart()
         self.window = start_from(state, self.config, self._context.calibration)

@@ -22,9 +22,11 @@ from scipy.special import chdtri
 from slam_graph.arrays import BoolArray, FloatArray, IntArray
 from slam_graph.backend.backend_config import BackendConfig
 from slam_graph.backend.cost.feature_tracks import is_in
+from slam_graph.backend.cost.gating import threshold
 from slam_graph.backend.objects.ego_motion import EgoMotion
 from slam_graph.backend.objects.objects_config import ObjectsConfig
 from slam_graph.backend.objects.relative_motion import RelativeMotion, motion_over
+from slam_graph.backend.objects.track_assignment import FITS
 from slam_graph.backend.objects.track_window import TrackWindow
 from slam_graph.backend.objects.tracked_object import TrackedObject
 from slam_graph.backend.policies import AlgorithmConfig
@@ -77,33 +79,34 @@ class ObjectReview:
     def of(self, item: TrackedObject) -> list[Part]:
         """What an object is: nothing if it is as it is known, one part to begin again, or two."""
         least = self._config.min_points
-        # an estimate that begins anew, which costs most, has no pose in the first frame of the
-        # window; where the others cannot fill it, it is not made
-        if not self._fill_the_window([s for s in self._window.stamps_ns[1:] if s in item.poses]):
+        # an estimate that begins anew costs most; where the other cannot fill the window, it is
+        # not made
+        if not self._fill_the_window([s for s in self._window.stamps_ns if s in item.poses]):
             return []
-        anew = self._begun(item.members)
+        members = item.taken
+        anew = self._begun(members)
         if anew is None:
             return []
         stamps = [stamp for stamp in anew.motion.poses if stamp in item.poses]
         if not self._fill_the_window(stamps):
             return []
-        current = self._total(item.members, item, stamps)
-        best, part = self._total(item.members, anew.motion, stamps), anew
+        current = self._total(members, item, stamps)
+        best, part = self._total(members, anew.motion, stamps), anew
         limit = float(chdtri(6 * (len(stamps) - 1), self._config.false_alarm))
         halves: list[Part] = []
         if (
             item.label == 0  # masks tell objects apart
-            and len(item.members) >= 2 * least
-            and min(current, best) > self._expected(item.members, stamps)
+            and len(members) >= 2 * least
+            and min(current, best) > self._expected(members, stamps)
         ):
-            halves = self._halves(item.members, least)
+            halves = self._halves(members, least)
         for half in halves:
-            squares = self._total(item.members, half.motion, stamps)
+            squares = self._total(members, half.motion, stamps)
             if squares < best:
                 best, part = squares, half
         if halves:
             apart = sum(self._total(half.members, half.motion, stamps) for half in halves)
-            if min(current, best) - apart > limit + _LABEL * len(item.members):
+            if min(current, best) - apart > limit + _LABEL * len(members):
                 return halves
         again = float(chdtri(6 * (len(stamps) - 1), _AGAIN))
         return [Part(item.members, part.motion)] if current - best > again else []
@@ -146,10 +149,13 @@ class ObjectReview:
         return None if motion is None else Part(members, motion)
 
     def _squares(self, members: IntArray, poses: dict[int, gtsam.Pose3]) -> FloatArray:
-        """(N,) squared errors of tracks over σ²; 0 for those that are too short."""
-        fit, squares, _ = self._window.misfit(members, poses, self._sigma_px)
+        """(N,) squared errors of tracks over σ²; 0 for those that are too short.
+
+        Beyond what a track of the body has they say that it is of none, not how it moves.
+        """
+        fit, squares, dof = self._window.misfit(members, poses, self._sigma_px)
         result = np.zeros(len(members))
-        result[is_in(members, fit)] = squares
+        result[is_in(members, fit)] = np.minimum(squares, threshold(dof, 1.0 - FITS))
         return result
 
     def _total(

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import gtsam
 import numpy as np
+from scipy.special import chdtri
 
 from slam_graph.arrays import FloatArray, IntArray, ascending_union
 from slam_graph.backend.backend_config import BackendConfig
@@ -110,7 +111,7 @@ class ObjectTracker:
         own = members_of(self.objects)
         others = _without(self._window.seen, own)
         test = self._tested(others, ego, sigma_px)
-        sigma_px *= self._noise_of(test)
+        sigma_px *= self._noise_of(test, ego, sigma_px)
         assignment = TrackAssignment(self._window, self._labels, ego, sigma_px)
         assignment.join(self.objects, test)
         self._leave(assignment, ego, sigma_px)
@@ -225,11 +226,17 @@ class ObjectTracker:
                     self.objects.remove(younger)
                     break
 
-    def _noise_of(self, test: MotionTest) -> float:
-        """Noise of the tracks that do not move, over what is assumed; at most 1."""
-        steady = test.misfits[~test.moves]
-        if len(steady) >= _ENOUGH:
-            ratio = float(np.clip(np.median(steady), _LEAST_NOISE**2, 1.0))
+    def _noise_of(self, test: MotionTest, ego: EgoMotion, sigma_px: float) -> float:
+        """Noise of the tracks that are not known to move, over what is assumed; at most 1.
+
+        It is read from the same squared errors that are compared for objects. Those of the test
+        are smaller: it allows for slow errors, which take a part of the noise.
+        """
+        static = dict(zip(ego.stamps_ns, ego.poses, strict=True))
+        _, squares, dof = self._window.misfit(test.ids[~test.moves], static, sigma_px)
+        if len(dof) >= _ENOUGH:
+            median = float(np.median(squares / chdtri(dof, 0.5)))
+            ratio = float(np.clip(median, _LEAST_NOISE**2, 1.0))
             self._noise_frames += 1
             weight = max(_NEWS, 1.0 / (1.0 + self._noise_frames))
             self._noise += weight * (float(np.sqrt(ratio)) - self._noise)

@@ -14,17 +14,20 @@ In the hybrid formulation of Bârsan et al. and DynoSAM the same observation is 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import X
 
-from slam_graph.arrays import FloatArray, IntArray
+from slam_graph.arrays import FloatArray, IntArray, ascending_union
 from slam_graph.backend.backend_config import BackendConfig
+from slam_graph.backend.cost.feature_tracks import is_in
 from slam_graph.backend.cost.selection_policies import FEATURE_POLICIES
 from slam_graph.backend.estimator import Estimator
 from slam_graph.backend.objects.ego_motion import EgoMotion
+from slam_graph.backend.objects.object_start import first_state
 from slam_graph.backend.objects.objects_config import ObjectsConfig
 from slam_graph.backend.objects.track_window import TrackWindow
 from slam_graph.backend.policies import AlgorithmConfig
@@ -96,8 +99,11 @@ class RelativeMotion:
             object_settings(backend, config),
             Diagnostics(),
         )
+        self._rig, self._config = rig.without_imu(), config
+        self._prior = backend.initialization.prior
         self._length_ns = round(length_s * 1e9)
         self._offset_ns = round(rig.pose_offset_s * 1e9)
+        self.known: IntArray = np.zeros(0, np.int64)  # ids of all features so far, ascending
         self._taken_ns = 0  # motion of the platform after this has not been added
         self._frames: dict[int, int] = {}  # index in the estimator of the frame with a stamp
         self.poses: dict[int, gtsam.Pose3] = {}  # object_T_body by stamp, as known now
@@ -107,11 +113,15 @@ class RelativeMotion:
         """Ids (N,) of the features that the gate rejected in the last frame, ascending."""
         return self._estimator.rejected
 
-    def add(self, frame: FeatureFrame, ego: EgoMotion) -> bool:
+    def add(
+        self, frame: FeatureFrame, ego: EgoMotion, earlier: Sequence[FeatureFrame] = ()
+    ) -> bool:
         """Take the features of the object in the next frame.
 
         Args:
             frame: its features.
+            earlier: past frames, in the order of time. What they saw of the features that are new
+                to the object counts as well.
             ego: the motion of the platform in the world. An object of constant velocity is an
                 inertial frame, in which the platform has the same acceleration and rate; those of
                 the object are the noise.
@@ -123,6 +133,10 @@ class RelativeMotion:
             EstimationError: if the equations cannot be solved: the object is lost.
         """
         self._add_motion(frame.stamp_ns, ego)
+        if not self.poses and not self._begun(frame, ego):
+            return False
+        self._add_earlier(frame, earlier)
+        self.known = ascending_union(self.known, frame.ids)
         try:
             state = self._estimator.add_frame(frame)
         except (RuntimeError, np.linalg.LinAlgError) as error:
@@ -142,6 +156,24 @@ class RelativeMotion:
             if i in past:
                 self.poses[stamp] = values.atPose3(X(i))
         return True
+
+    def _begun(self, frame: FeatureFrame, ego: EgoMotion) -> bool:
+        """Begin in a frame, if enough of its features have a depth."""
+        state = first_state(frame, ego, self._rig, self._prior, self._config.min_points)
+        if state is not None:
+            self._estimator.start(state, with_rate=True)
+        return state is not None
+
+    def _add_earlier(self, frame: FeatureFrame, earlier: Sequence[FeatureFrame]) -> None:
+        """Add what past frames saw of the features of a frame that were not given before."""
+        window, new = self._estimator.window, frame.ids[~is_in(frame.ids, self.known)]
+        if window is None or len(new) == 0:
+            return
+        kept = {*window.past, window.frame}
+        for past in earlier:
+            if self._frames.get(past.stamp_ns) in kept:
+                seen = past.only(new).usable(len(self._rig.cameras))[0]
+                window.tracks.add(self._frames[past.stamp_ns], seen)
 
     def _add_motion(self, now_ns: int, ego: EgoMotion) -> None:
         """Add the motion of the platform since the last frame that was taken."""

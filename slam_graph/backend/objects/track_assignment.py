@@ -25,7 +25,7 @@ from slam_graph.backend.objects.tracked_object import TrackedObject
 MARGIN = 12.0
 """Twice the logarithm of the ratio of likelihoods from which a track is of one world and not of
 another: 1 in 400."""
-_FITS = 1e-4
+FITS = 1e-4
 """Probability of the errors of a track that fits."""
 _CLEARLY = 2.0
 """Factor on that limit for tracks that are of an object already."""
@@ -88,7 +88,7 @@ class TrackAssignment:
         be called first: it finds how well tracks fit.
         """
         fit, squares, dof = self._misfit(item, item.members)
-        unfit = squares > _CLEARLY * _scale(squares, dof) * threshold(dof, 1.0 - _FITS)
+        unfit = squares > _CLEARLY * _scale(squares, dof) * threshold(dof, 1.0 - FITS)
         leaving = ascending_union(fit[unfit], self._labels.contradicted(item.members, item.label))
         if not item.moving:
             return leaving
@@ -96,7 +96,7 @@ class TrackAssignment:
         fit, squares = fit[rest], squares[rest]
         frames = {stamp: pose for stamp, pose in self._static.items() if stamp in item.poses}
         same, alone, dof = self._window.misfit(fit, frames, self._sigma_px)
-        alone, limit = _for(fit, same, alone), _for(fit, same, threshold(dof, 1.0 - _FITS))
+        alone, limit = _for(fit, same, alone), _for(fit, same, threshold(dof, 1.0 - FITS))
         static = (squares - alone > MARGIN) & (alone < limit)
         return ascending_union(leaving, fit[static])
 
@@ -120,7 +120,7 @@ class TrackAssignment:
         They are infinite where a track does not fit, or is not of its mask.
         """
         fit, errors, dof = self._misfit(item, self._labels.allowed(ids, item.label))
-        limit = self._scale(item) * threshold(dof, 1.0 - _FITS)
+        limit = self._scale(item) * threshold(dof, 1.0 - FITS)
         return _for(ids, fit, np.where(errors < limit, errors, np.inf))
 
     def _as_static(self, ids: IntArray, wanted: BoolArray) -> FloatArray:

@@ -107,6 +107,11 @@ class TrackedObject:
         """Poses of the platform relative to the object, by the stamps of frames."""
         return self._motion.poses
 
+    @property
+    def taken(self) -> IntArray:
+        """Ids (N,) of those of its tracks that its estimate rests on: not of what just joined."""
+        return self.members[is_in(self.members, self._motion.known)]
+
     def points(self) -> FloatArray:
         """(N, 3) its points, in its own frame, m."""
         _, points = self._motion.points()
@@ -154,7 +159,7 @@ class TrackedObject:
         if len(self.members) < 4:
             return None
         if frame.stamp_ns not in self._motion.poses and not self._motion.add(
-            frame.only(self.members), ego
+            frame.only(self.members), ego, list(window.frames)[:-1]
         ):
             return None
         self._drop_rejected()
