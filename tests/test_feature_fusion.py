@@ -253,18 +253,28 @@ def test_chance_agrees_on_no_drift() -> None:
     assert found <= 1
 
 
-@pytest.mark.parametrize(("share", "least"), [(0.0, 0.0), (0.25, 0.4), (0.8, 0.9)])
-def test_probabilities_of_matches_are_their_frequencies(share: float, least: float) -> None:
-    """Sets of 40, of which some are true: of those that are believed few are false."""
+@pytest.mark.parametrize(
+    ("share", "scatter", "least"),
+    [(0.0, 0.0, 0.0), (0.25, 0.0, 0.4), (0.8, 0.0, 0.9), (0.0, 8.0, 0.0), (0.25, 8.0, 0.8)],
+)
+def test_probabilities_of_matches_are_their_frequencies(
+    share: float, scatter: float, least: float
+) -> None:
+    """Sets of 40, of which some are true: of those that are believed few are false.
+
+    With depths, which scatter among false ones, more can be believed.
+    """
     rng = np.random.default_rng(3)
     reach, count = 10.0, 40
     found = wrong = expected = 0.0
     for _ in range(200):
         true = np.arange(count) < round(share * count)
         radius, angle = reach * np.sqrt(rng.random(count)), rng.uniform(-np.pi, np.pi, count)
-        uniform = np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1)
-        offsets = np.where(true[:, None], rng.normal(size=(count, 2)), uniform)
-        probabilities = match_probabilities(offsets, np.full(count, reach**-2.0))
+        depths = scatter * rng.normal(size=count)
+        false = np.stack([radius * np.cos(angle), radius * np.sin(angle), depths], axis=1)
+        offsets = np.where(true[:, None], rng.normal(size=(count, 3)), false)
+        known = offsets if scatter else offsets[:, :2]
+        probabilities = match_probabilities(known, np.full(count, reach**-2.0))
         good = probabilities > 0.9
         found, wrong = found + np.sum(good & true), wrong + np.sum(good & ~true)
         expected += np.sum(1.0 - probabilities[good])

@@ -35,6 +35,10 @@ _MAX_FALSE_ALARMS = 0.01
 _SAMPLES = 100
 _REFINEMENTS = 3
 _EM_STEPS = 30
+_NORMAL_MEDIAN = 0.6745
+"""Of the absolute value of a standard normal variable."""
+_NO_CHANCE = 1e-300
+"""Keeps probabilities defined where both densities vanish."""
 
 
 def drift_jacobian(by_point: FloatArray, arms: FloatArray) -> FloatArray:
@@ -104,20 +108,26 @@ def _largest_set(
 def match_probabilities(residuals: FloatArray, chances: FloatArray) -> FloatArray:
     """Probability of each match of a set to be true, by expectation maximisation.
 
-    In the image residuals of true matches are normal with unit covariance, and those of false ones
-    uniform. The share of true ones is found from the set itself: where most matches are false, one
-    must be closer to be believed.
+    Residuals of true matches are normal with unit covariance. Those of false ones are uniform in
+    the image, and their depths scatter more widely. The share of true matches and the scatter of
+    the depths of false ones are found from the set itself: where most matches are false, one must
+    be closer to be believed.
 
     Args:
-        residuals: (P, m) in standard deviations; the first two are in the image.
-        chances: (P,) probability that a false match has an offset below a standard deviation.
+        residuals: (P, 2 or 3) in standard deviations: in the image, and of the inverse depth.
+        chances: (P,) probability that a false match has an offset in the image below a standard
+            deviation.
     """
-    true = np.exp(-0.5 * np.sum(residuals[:, :2] ** 2, axis=1)) / (2.0 * math.pi)
-    false = chances / math.pi
+    squares = np.sum(residuals[:, :2] ** 2, axis=1)
+    depths = np.abs(residuals[:, 2]) if residuals.shape[1] > 2 else np.zeros(len(residuals))
+    true = np.exp(-0.5 * (squares + depths**2)) / (2.0 * math.pi)
     probabilities = np.full(len(residuals), 0.5)
     for _ in range(_EM_STEPS):
+        others = depths[probabilities <= 0.5]
+        scatter = max(float(np.median(others)) / _NORMAL_MEDIAN, 1.0) if len(others) else 1.0
+        false = chances / math.pi * np.exp(-0.5 * (depths / scatter) ** 2) / scatter
         share = np.mean(probabilities)
-        probabilities = share * true / (share * true + (1.0 - share) * false)
+        probabilities = share * true / (share * true + (1.0 - share) * false + _NO_CHANCE)
     return probabilities
 
 
