@@ -284,6 +284,10 @@ def test_probabilities_of_matches_are_their_frequencies(
     assert found >= least * share * 200 * count
 
 
+def test_no_matches_have_no_probabilities() -> None:
+    assert match_probabilities(np.zeros((0, 3)), np.zeros(0)).shape == (0,)
+
+
 def test_a_turn_about_the_vertical_is_what_its_derivative_says() -> None:
     arm, turn = np.array([[1.0, 2.0, 0.5]]), 1e-6
     J = drift_jacobian(np.eye(3)[None, :2], arm)

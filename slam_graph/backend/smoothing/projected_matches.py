@@ -122,7 +122,7 @@ def match_probabilities(residuals: FloatArray, chances: FloatArray) -> FloatArra
     depths = np.abs(residuals[:, 2]) if residuals.shape[1] > 2 else np.zeros(len(residuals))
     true = np.exp(-0.5 * (squares + depths**2)) / (2.0 * math.pi)
     probabilities = np.full(len(residuals), 0.5)
-    for _ in range(_EM_STEPS):
+    for _ in range(_EM_STEPS if len(residuals) else 0):
         others = depths[probabilities <= 0.5]
         scatter = max(float(np.median(others)) / _NORMAL_MEDIAN, 1.0) if len(others) else 1.0
         false = chances / math.pi * np.exp(-0.5 * (depths / scatter) ** 2) / scatter
