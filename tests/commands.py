@@ -111,6 +111,7 @@ def _become(asked: dict[str, Any], writing: tuple[int, ...]) -> None:
         os.dup2(end, number)
         os.close(end)
     sys.stdin, sys.stdout, sys.stderr = _stream(0, "r"), _stream(1, "w"), _stream(2, "w")
+    os.setsid()
     os.chdir(asked["cwd"])
     os.environ.clear()
     os.environ.update(asked["env"])
@@ -135,7 +136,8 @@ def _read(pid: int, reading: tuple[int, ...]) -> list[str]:
             selector.register(end, selectors.EVENT_READ)
         while selector.get_map():
             if time.monotonic() > deadline:
-                os.kill(pid, signal.SIGKILL)
+                os.killpg(pid, signal.SIGKILL)  # with all processes that hold its streams
+                break
             for key, _ in selector.select(timeout=1.0):
                 part = os.read(key.fd, 1 << 16)
                 parts[key.fd] += part
@@ -143,7 +145,7 @@ def _read(pid: int, reading: tuple[int, ...]) -> list[str]:
                     selector.unregister(key.fd)
     for end in reading:
         os.close(end)
-    return [parts[end].decode() for end in reading]
+    return [parts[end].decode(errors="replace") for end in reading]
 
 
 if __name__ == "__main__":

@@ -29,7 +29,7 @@ LONGEST = (
     "position_fixes", "verdict", "recovery", "notebooks", "without_imu", "repeats", "policy_nees",
     "clock_monitor", "estimator_end_to_end", "documented_start", "known_poses", "clock_windows",
 )  # fmt: skip
-"""Files of tests that take a minute or two each; they begin, so that no core ends with one."""
+"""Files of tests that take a minute or two each; they run first, so that no core ends with one."""
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -140,7 +140,7 @@ class Estimator(EstimatorKnowledge):
 
         Args:
             state: with its covariance.
-            with_rate: whether, without an IMU, its bias is the angular rate, negative.
+            with_rate: whether its gyroscope bias stands for the angular rate, without an IMU.
 
         Raises:
             EstimationError: if the state has no covariance.

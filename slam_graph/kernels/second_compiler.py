@@ -12,6 +12,7 @@ import subprocess
 import sys
 from contextlib import suppress
 from importlib import import_module
+from pathlib import Path
 from pkgutil import iter_modules
 from threading import Thread
 
@@ -20,31 +21,40 @@ import slam_graph.kernels
 __all__ = ["start_second_compiler"]
 
 _ITSELF = "SLAM_GRAPH_SECOND_COMPILER"
-"""Set in its environment, so that it starts none of its own."""
+"""Set in the environment once it has been started, so that no process starts another."""
 
 
 def start_second_compiler() -> None:
     """Compile kernels from the last to the first, on another core, if there is one.
 
-    Who imports kernels from the first to the last finds them in the cache from about the middle on;
-    one that both compile at the same time is stored twice, with the same content. Nobody waits for
-    the process, and where it cannot be started kernels are compiled as without it.
+    A process that imports kernels from the first to the last finds them in the cache from about the
+    middle on; one that both compile at the same time is stored twice, with the same content. Nobody
+    waits for the process, and where it cannot be started kernels are compiled as without it.
     """
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    if sys.executable and (cores or 1) > 1 and _ITSELF not in os.environ:
+    # within an application it would start that application again
+    is_python = Path(sys.executable or "").name.startswith("python")
+    if is_python and not hasattr(sys, "frozen") and _cores() > 1 and _ITSELF not in os.environ:
+        os.environ[_ITSELF] = "1"  # the processes of this one need none of their own
         Thread(target=_run, name="second compiler", daemon=True).start()
+
+
+def _cores() -> int:
+    """Cores that this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
 
 
 def _run() -> None:
     """Run it to its end; what it imports is what this process imports."""
-    paths = os.pathsep.join(path for path in sys.path if path)
+    paths = os.pathsep.join(str(path) or os.getcwd() for path in sys.path)
     with suppress(OSError):
         subprocess.run(
             [sys.executable, "-P", "-m", __spec__.name],
             stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
-            env={**os.environ, "PYTHONPATH": paths, _ITSELF: "1"},
+            env={**os.environ, "PYTHONPATH": paths},
             check=False,
         )
 

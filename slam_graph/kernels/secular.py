@@ -21,7 +21,7 @@ __all__ = [
 _SWEEPS = 12
 """Most sweeps of Jacobi's rotations; they converge quadratically, after some four."""
 _NEGLIGIBLE = 1e-300
-"""Entries below this are zero."""
+"""Entries below this are taken for zero."""
 _LEAST = 1e-12
 """A multiplier begins so far above the pole, relative to the largest eigenvalue."""
 

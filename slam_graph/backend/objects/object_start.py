@@ -44,11 +44,11 @@ def first_state(
         min_points: fewest features with a depth.
 
     Returns:
-        The state as `constant_velocity` has it; None with fewer features.
+        The state as `constant_velocity` has it; None with fewer features, or without a pose.
     """
     known = depths_within(frame, rig)
     points = known.points[known.located]
-    if len(points) < min_points:
+    if len(points) < min_points or frame.stamp_ns not in ego.stamps_ns:
         return None
     row = ego.stamps_ns.index(frame.stamp_ns)
     pose = ego.poses[row]

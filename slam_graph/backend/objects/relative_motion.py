@@ -161,6 +161,7 @@ class RelativeMotion:
         """Begin in a frame, if enough of its features have a depth."""
         state = first_state(frame, ego, self._rig, self._prior, self._config.min_points)
         if state is not None:
+            self.known = np.zeros(0, np.int64)
             self._estimator.start(state, with_rate=True)
         return state is not None
 
