@@ -30,7 +30,7 @@ def first_frame() -> tuple[FeatureFrame, EgoMotion, Rig]:
     return frame, EgoMotion((frame.stamp_ns,), (pose,), velocity[None], state, *flat), sequence.rig
 
 
-def test_the_middle_of_an_object_moves_as_it_likes_and_the_rest_turns_about_it() -> None:
+def test_the_velocity_of_the_middle_is_unknown_and_the_rest_turns_about_it() -> None:
     frame, ego, rig = first_frame()
     state = first_state(frame, ego, rig, PriorConfig(), 6)
     assert state is not None

@@ -17,6 +17,7 @@ from pkgutil import iter_modules
 from threading import Thread
 
 import slam_graph.kernels
+from slam_graph.cores import usable_cores
 
 __all__ = ["start_second_compiler"]
 
@@ -33,16 +34,14 @@ def start_second_compiler() -> None:
     """
     # within an application it would start that application again
     is_python = Path(sys.executable or "").name.startswith("python")
-    if is_python and not hasattr(sys, "frozen") and _cores() > 1 and _ITSELF not in os.environ:
+    if (
+        is_python
+        and not hasattr(sys, "frozen")
+        and usable_cores() > 1
+        and _ITSELF not in os.environ
+    ):
         os.environ[_ITSELF] = "1"  # the processes of this one need none of their own
         Thread(target=_run, name="second compiler", daemon=True).start()
-
-
-def _cores() -> int:
-    """Cores that this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
 
 
 def _run() -> None:

@@ -33,6 +33,7 @@ import numpy as np
 
 from slam_graph.arrays import FloatArray, median
 from slam_graph.backend.backend_config import NoiseConfig
+from slam_graph.backend.cost.robust_loss import MEDIAN_1D
 from slam_graph.geometry import NavState
 from slam_graph.sensors import ImuBuffer, ImuData, ImuNoise
 
@@ -56,8 +57,6 @@ _FEWEST_SAMPLES = 20
 """Fewer samples within that time tell nothing."""
 _THIRD_DIFFERENCE = np.sqrt(20.0)
 """Standard deviation of the third difference of white noise of 1."""
-_NORMAL_MEDIAN = 0.6745
-"""Median of the absolute value of a normal variable, in units of its standard deviation."""
 GYRO_SCALE_SIGMA, ACCEL_SCALE_SIGMA = 1.25e-4, 1e-3
 """Standard deviations of scale and alignment after calibration, relative; that of the gyroscope per
 rad/s."""
@@ -244,7 +243,7 @@ class DynamicsNoise:
         for _ in range(3):  # NumPy's `diff` takes as long again
             accel = accel[1:] - accel[:-1]
         size = float(median(np.abs(accel).ravel()))
-        sigma = size / (_NORMAL_MEDIAN * _THIRD_DIFFERENCE)
+        sigma = size / (MEDIAN_1D * _THIRD_DIFFERENCE)
         density = self._config.imu_scale * self._imu.accel_noise_density
         return bool(sigma > _VIBRATION_RATIO * density / np.sqrt(spacing_s))
 

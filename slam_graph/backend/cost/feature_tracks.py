@@ -203,6 +203,11 @@ class FeatureTracks:
 
     def add(self, index: int, frame: FeatureFrame) -> None:
         """Add the observations of a new frame, later than all before."""
+        self.add_past(index, frame)
+        self.seen = frame.ids
+
+    def add_past(self, index: int, frame: FeatureFrame) -> None:
+        """Add the observations of features in a frame that is later than all others of them."""
         old, new = len(self), [len(camera) for camera in frame.cameras]
         numbers = np.empty((3, old + sum(new)), np.int64)
         places = np.empty((2, numbers.shape[1], 2))
@@ -212,7 +217,6 @@ class FeatureTracks:
             rows = slice(begin, begin := begin + size)
             numbers[0, rows], numbers[2, rows] = camera.ids, number
             places[0, rows], places[1, rows] = camera.pixels, camera.normalized
-        self.seen = frame.ids
         self.added += sum(new)
         order = numbers[0].argsort(kind="stable")
         self._numbers, self._places = numbers.take(order, axis=1), places.take(order, axis=1)

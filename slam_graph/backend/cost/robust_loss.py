@@ -24,6 +24,9 @@ WIDTH_2D = 2.45
 MEDIAN_2D = math.sqrt(2.0 * math.log(2.0))
 """The length that half of them do not exceed."""
 
+MEDIAN_1D = 0.6745
+"""Median of the absolute value of a normal variable, in units of its standard deviation."""
+
 
 @dataclass(frozen=True, slots=True)
 class RobustLoss:

@@ -25,6 +25,7 @@ from gtsam.symbol_shorthand import V, X
 from slam_graph.arrays import FloatArray, IntArray, ascending_union, median
 from slam_graph.backend.backend_config import ZeroVelocityConfig
 from slam_graph.backend.cost.feature_tracks import is_in
+from slam_graph.backend.cost.robust_loss import MEDIAN_1D
 from slam_graph.sensors import FeatureFrame, FeatureObservations, ImuBuffer, ImuData
 
 _DYNAMIC_RATIO = 3.0
@@ -61,9 +62,6 @@ _BRIDGE = 2.0
 
 _MAX_NOISE_PX = 3.0
 """Noisier tracks are wrong matches, and tell nothing."""
-
-_NORMAL_MEDIAN = 0.6745
-"""Median of the absolute value of a standard normal variable."""
 
 MIN_FEATURES = 5
 """Fewer common features than this do not show whether the image moves."""
@@ -165,7 +163,7 @@ class StandstillDetector:
         change -= 2.0 * second.pixels.take(places[0][here], axis=0)
         change -= median(change)
         # a second difference of independent errors has the variance (1 + 4 + 1) σ²
-        return float(median(np.abs(change).ravel())) / (_NORMAL_MEDIAN * math.sqrt(6.0))
+        return float(median(np.abs(change).ravel())) / (MEDIAN_1D * math.sqrt(6.0))
 
     def _limit_px(self, motion_px: float, share: float, features: int) -> float:
         """Limit on a quantile of N differences, for a limit on what is motion in them."""

@@ -42,8 +42,6 @@ _ROUNDS, _LINEAR_RAD_S = 2, 1e-3
 _MAX_STEPS, _CONVERGED = 30, 1e-6
 """Most steps of each time, and the relative change of the cost at which they end: a thousandth of
 the bias's noise."""
-
-
 _TINY = 1e-12
 """Keeps divisions finite."""
 _NORMALS = skew(np.eye(3)).transpose(2, 1, 0)[:, None, :, :, None] * np.eye(3)[:, None, None, :]
@@ -252,7 +250,7 @@ def _pairs(common: BearingPairs, intervals: Intervals, bias: FloatArray) -> _Pai
         return None
     rotations, derivatives = intervals.rotations(bias)
     R, by_bias = rotations[interval], derivatives[interval]
-    noise = np.array(_noise(moments, R, counts))
+    noise = _noise(moments, R, counts)
     whitening = np.asarray(np.linalg.inv(np.linalg.cholesky(noise)), np.float64)
     return _Pairs(interval, moments, R, by_bias, whitening)
 

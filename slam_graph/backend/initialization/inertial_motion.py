@@ -93,13 +93,13 @@ class Intervals:
 
         Those of the last bias are kept: rotations and the motion are asked for one after the other.
         """
-        if self._last is None or self._last[0] is not gyro_bias:
+        if self._last is None or not np.array_equal(self._last[0], gyro_bias):
             turns = np.asarray((self._gyro - gyro_bias) * self._durations_s[:, :, None])
             attitudes = np.empty((len(turns) + 1, turns.shape[1], 3, 3))
             attitudes[0] = np.eye(3)
             for s, step in enumerate(_exponentials(turns)):
                 np.matmul(attitudes[s], step, out=attitudes[s + 1])
-            self._last = gyro_bias, turns, attitudes
+            self._last = gyro_bias.copy(), turns, attitudes
         return self._last[1:]
 
 

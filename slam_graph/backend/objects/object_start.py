@@ -31,7 +31,7 @@ _RATE_SIGMA = 0.3
 def first_state(
     frame: FeatureFrame, ego: EgoMotion, rig: Rig, prior: PriorConfig, min_points: int
 ) -> NavState | None:
-    """The platform in the frame of an object that begins now, which is that of the world then.
+    """The platform in the frame of an object that begins now, where that frame is the world's.
 
     The object moves by v about its middle c and turns by ω. In its frame the velocity of the
     platform at p is less by v + ω × (p - c), and its angular rate by ω.
@@ -40,7 +40,7 @@ def first_state(
         frame: features of the object.
         ego: the motion of the platform, which has the frame.
         rig: the cameras.
-        prior: what holds the pose, which is free.
+        prior: standard deviations that fix the pose, which nothing determines.
         min_points: fewest features with a depth.
 
     Returns:

@@ -174,7 +174,7 @@ class RelativeMotion:
         for past in earlier:
             if self._frames.get(past.stamp_ns) in kept:
                 seen = past.only(new).usable(len(self._rig.cameras))[0]
-                window.tracks.add(self._frames[past.stamp_ns], seen)
+                window.tracks.add_past(self._frames[past.stamp_ns], seen)
 
     def _add_motion(self, now_ns: int, ego: EgoMotion) -> None:
         """Add the motion of the platform since the last frame that was taken."""

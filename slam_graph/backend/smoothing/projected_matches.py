@@ -27,6 +27,7 @@ from scipy.special import bdtrc
 from slam_graph.arrays import BoolArray, FloatArray, IntArray
 from slam_graph.backend.cost.feature_tracks import Observations
 from slam_graph.backend.cost.reprojection import Geometry, RigProjection
+from slam_graph.backend.cost.robust_loss import MEDIAN_1D
 from slam_graph.kernels.near_pairs import near_pairs
 
 _DRIFT_SIGMAS = np.array([0.1, 0.1, 0.1, 0.02])
@@ -35,8 +36,6 @@ _MAX_FALSE_ALARMS = 0.01
 _SAMPLES = 100
 _REFINEMENTS = 3
 _EM_STEPS = 30
-_NORMAL_MEDIAN = 0.6745
-"""Of the absolute value of a standard normal variable."""
 _NO_CHANCE = 1e-300
 """Keeps probabilities defined where both densities vanish."""
 
@@ -124,7 +123,7 @@ def match_probabilities(residuals: FloatArray, chances: FloatArray) -> FloatArra
     probabilities = np.full(len(residuals), 0.5)
     for _ in range(_EM_STEPS if len(residuals) else 0):
         others = depths[probabilities <= 0.5]
-        scatter = max(float(np.median(others)) / _NORMAL_MEDIAN, 1.0) if len(others) else 1.0
+        scatter = max(float(np.median(others)) / MEDIAN_1D, 1.0) if len(others) else 1.0
         false = chances / math.pi * np.exp(-0.5 * (depths / scatter) ** 2) / scatter
         share = np.mean(probabilities)
         probabilities = share * true / (share * true + (1.0 - share) * false + _NO_CHANCE)

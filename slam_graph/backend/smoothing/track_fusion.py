@@ -98,7 +98,8 @@ def with_fused_features(
     tried = [own]
     for _ in range(_MAX_ROUNDS):
         label = _labels(segment, states, task.rig, task.backend)
-        # a few features may be fused and separated in turn
+        # a few features may be fused and separated in turn; the adjustment that follows begins near
+        # the minimum with either
         least = min(int(np.sum(label != before)) for before in tried)
         if least <= _SETTLED * np.sum(label != own):
             break
