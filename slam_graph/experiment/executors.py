@@ -14,7 +14,6 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, Protocol
 
-from slam_graph.cores import usable_cores
 from slam_graph.errors import ConfigError, DataError, closest
 from slam_graph.experiment.tasks import Task
 
@@ -52,11 +51,11 @@ class LocalProcesses:
     """Runs each task in a new process on this machine.
 
     Args:
-        workers: processes at a time; one for each usable core if None.
+        workers: processes at a time; the number of cores if None.
     """
 
     def __init__(self, workers: int | None = None) -> None:
-        self.workers = workers or usable_cores()
+        self.workers = workers or os.cpu_count() or 1
         self._running: set[_TaskProcess] = set()
         self._stopped = False
 

@@ -15,9 +15,11 @@ from importlib import import_module
 from pathlib import Path
 from pkgutil import iter_modules
 from threading import Thread
+from typing import Any
+
+import numba
 
 import slam_graph.kernels
-from slam_graph.cores import usable_cores
 
 __all__ = ["start_second_compiler"]
 
@@ -34,12 +36,9 @@ def start_second_compiler() -> None:
     """
     # within an application it would start that application again
     is_python = Path(sys.executable or "").name.startswith("python")
-    if (
-        is_python
-        and not hasattr(sys, "frozen")
-        and usable_cores() > 1
-        and _ITSELF not in os.environ
-    ):
+    settings: Any = numba.config  # its names are made when it is imported
+    several = settings.NUMBA_DEFAULT_NUM_THREADS > 1  # cores that this process may use
+    if is_python and not hasattr(sys, "frozen") and several and _ITSELF not in os.environ:
         os.environ[_ITSELF] = "1"  # the processes of this one need none of their own
         Thread(target=_run, name="second compiler", daemon=True).start()
 

@@ -8,6 +8,7 @@ frame k reaches the front end before frame k + 2, in either mode: results are th
 
 from __future__ import annotations
 
+import os
 import threading
 import time
 from collections import deque
@@ -17,7 +18,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from slam_graph.cores import usable_cores
 from slam_graph.datasets import Sequence
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.frontend import Feedback, Frontend
@@ -209,7 +209,8 @@ def can_overlap() -> bool:
     """
     if threading.current_thread() is not threading.main_thread():
         return False
-    return ForkedCall.is_possible() and usable_cores() > 1
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    return ForkedCall.is_possible() and (cores or 1) > 1
 
 
 def packets_of(sequence: Sequence, asked: RunInput) -> Iterator[Packet]:
