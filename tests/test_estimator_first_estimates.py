@@ -11,10 +11,13 @@ import gtsam
 import numpy as np
 import pytest
 from flight import Flight, packets, rig, room
+from gtsam.symbol_shorthand import X
 from scipy.linalg import eigh
 
 from slam_graph.arrays import FloatArray
 from slam_graph.backend.backend_config import BackendConfig, InitializationConfig
+from slam_graph.backend.cost import construction
+from slam_graph.backend.cost.construction import ConstructedCost, CostConstruction
 from slam_graph.backend.cost.cost import Cost
 from slam_graph.backend.cost.imu_factor import imu_factor
 from slam_graph.backend.engine import SquareRootEngine
@@ -23,6 +26,7 @@ from slam_graph.backend.marginalization.marginalize import unobservable_directio
 from slam_graph.backend.policies import AlgorithmConfig
 from slam_graph.backend.solve.square_root import Layout
 from slam_graph.backend.solve.state import State, dims_of
+from slam_graph.backend.window import Window
 from slam_graph.config import load_config
 from slam_graph.sensors.measurements import FeatureFrame
 
@@ -129,3 +133,48 @@ def test_the_dynamics_do_not_see_these_directions() -> None:
     assert np.linalg.norm(b) > 100.0
     change = A @ unobservable_directions(state.first, layout)
     np.testing.assert_allclose(change, 0.0, atol=1e-9 * np.abs(A).max())
+
+
+def moved_shares(monkeypatch: pytest.MonkeyPatch, largest: float) -> FloatArray:
+    """How far measured features of the state are from their first estimates, over their distance.
+
+    The camera flies towards points, one after the other, and past them.
+    """
+    monkeypatch.setattr(construction, "MAX_MOVED", largest)
+    shares: list[FloatArray] = []
+    construct = CostConstruction.construct
+
+    def kept(self: CostConstruction, window: Window, still: bool) -> ConstructedCost:
+        constructed = construct(self, window, still)
+        measured, state = constructed.cost.landmarks, window.state
+        if measured is not None:
+            points = state.positions_of(measured.ids)
+            away = points - state.frames.atPose3(X(window.frame)).translation()
+            moved = points - state.positions_of(measured.ids, first=True)
+            shares.append(np.linalg.norm(moved, axis=1) / np.linalg.norm(away, axis=1))
+        return constructed
+
+    monkeypatch.setattr(CostConstruction, "construct", kept)
+    settings = ["algorithm.cost.state_feature_depth_error=0.3"]
+    algorithm: AlgorithmConfig = load_config(algorithm="msckf", overrides=settings).algorithm
+    rng, mounted = np.random.default_rng(2), rig()
+    flight = Flight(position=np.array([2.5, 0.3, 0.2]), position_rate=np.array([0.9, 1.7, 2.3]))
+    near = rng.uniform([-2.0, -0.3, -0.3], [3.0, 0.3, 0.3], (40, 3))
+    points = np.concatenate([near, room(250, rng)])
+    noise = CONFIG.noise.model_copy(update={"pixel_sigma": 3.0})
+    estimator = Estimator(mounted, algorithm, CONFIG.model_copy(update={"noise": noise}))
+    estimator.start(flight.nav_state(0.0, WEAK))
+    for packet in packets(flight, mounted, points, 6.0, rng, 20.0, sigma_px=3.0):
+        assert isinstance(packet.frame, FeatureFrame)
+        estimator.add_imu(packet.imu)
+        assert estimator.add_frame(packet.frame) is not None
+    return np.concatenate(shares)
+
+
+def test_what_has_moved_far_from_its_first_estimate_is_not_measured_again(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Its Jacobian would be that of another distance, and turn the platform."""
+    assert moved_shares(monkeypatch, np.inf).max() > 0.5
+    monkeypatch.undo()
+    assert moved_shares(monkeypatch, construction.MAX_MOVED).max() <= 0.5

@@ -15,7 +15,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from gtsam.symbol_shorthand import L
+from gtsam.symbol_shorthand import L, X
 
 from slam_graph.arrays import BoolArray, IntArray, ascending_union
 from slam_graph.backend.backend_config import BackendConfig
@@ -45,6 +45,10 @@ from slam_graph.backend.window import Window
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import EstimationError
 
+MAX_MOVED = 0.5
+"""Features of the state that have moved from their linearisation point by more than this share of
+their distance are not measured again. Jacobians go as one over the distance: there they are up to
+twice as large as they should be."""
 _MAX_FAILURES = 3
 """Features that are outliers in this many consecutive frames are treated as dynamic."""
 
@@ -155,8 +159,7 @@ class CostConstruction:
         poses = self._selected_poses(window)
         rows = cost.factor_rows(cost.layout())
         predicted = cost.prior_at_estimate().updated(rows, overwrite=True, overwrite_rows=True)
-        waiting = window.tracks.ids_waiting()
-        in_state = window.state_features[is_in(window.state_features, waiting)]
+        in_state = self._measured_again(window)
         cost.landmarks = window.tracks.observations(in_state)
         cost.tracks = self._selection.new_features(
             window, cost.state, poses, len(in_state), self._dynamic, removals
@@ -197,6 +200,23 @@ class CostConstruction:
         cost = Cost(state, rig, self.config, window.prior, factors, loss=self._loss)
         cost.sigma_px = self.pixels.sigma_px
         return cost
+
+    def _measured_again(self, window: Window) -> IntArray:
+        """The features of the state that the current frame sees, ascending, and that still fit it.
+
+        Where an estimate is far from its linearisation point, the Jacobian there is wrong and would
+        turn the platform. Such features leave the state, and their tracks start anew. Lost features
+        that are kept for when they are seen again would come back at once, and go on.
+        """
+        waiting = window.tracks.ids_waiting()
+        ids = window.state_features[is_in(window.state_features, waiting)]
+        if self.policy.keep_lost_features:
+            return ids
+        state = window.state
+        points, first = state.positions_of(ids), state.positions_of(ids, first=True)
+        here = state.frames.atPose3(X(window.frame)).translation()
+        moved, away = (np.add.reduce((points - p) ** 2, axis=1) for p in (first, here))
+        return ids[moved <= MAX_MOVED**2 * away]
 
     def _selected_poses(self, window: Window) -> PoseSelection:
         poses = self._select_poses(window, self.policy, self.rig)
