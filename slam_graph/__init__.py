@@ -12,8 +12,6 @@ The names below are all that most programs need. Each is imported when it is fir
     sg.load_result("results/mine").trajectory
 """
 
-from typing import TYPE_CHECKING
-
 from slam_graph.lazy import lazy_exports
 from slam_graph.version import __version__
 
@@ -54,6 +52,9 @@ __all__ = [
     "save_map",
     "simulate",
 ]
+
+TYPE_CHECKING = False
+"""As in `typing`, which takes too long: a signal may come before the command minds it."""
 
 if TYPE_CHECKING:
     from slam_graph.backend import Estimator

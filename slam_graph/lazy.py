@@ -2,10 +2,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """Public names of a package that are imported when they are first used."""
 
-from collections.abc import Callable, Mapping
+from __future__ import annotations
+
 from importlib import import_module
 from sys import modules
-from typing import Any
+
+TYPE_CHECKING = False  # `typing` takes too long for what is imported before all else
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+    from typing import Any
 
 __all__ = ["lazy_exports"]
 
