@@ -129,11 +129,12 @@ def test_errors_of_scale_and_alignment_change_the_biases_as_the_motion_changes(
 
 def mean_nees(noise_scale: float, adaptive: bool) -> float:
     """Of the poses (6 is ideal) of a simulated flight with noisier samples than calibrated."""
-    flight = {"duration_s": 15.0, "seed": 3, "imu": {"noise_scale": noise_scale}}
+    flight = {"duration_s": 15.0, "rate_hz": 10.0, "seed": 3, "imu": {"noise_scale": noise_scale}}
     overrides = [
         f"backend.noise.adaptive.enabled={adaptive}",
         "backend.initialization.mode=given",
         "cameras=2",
+        "final_ba.enabled=false",
     ]
     sequence = simulate(SimulationConfig(**flight, tracks={"features": 40}))
     result = run(sequence, load_config(algorithm="msckf", overrides=overrides))

@@ -14,12 +14,12 @@ CAUSAL = {"final_ba.enabled": False}
 LOST = "frames_dropped:at_s={},duration_s=3"
 
 
-def flight(cameras: int, seed: int, duration_s: float) -> SimulatedSequence:
+def flight(cameras: int, seed: int, duration_s: float, rate_hz: float = 10.0) -> SimulatedSequence:
     """Through rooms of one world, which are recognised by descriptors."""
     return simulate(
         trajectory="rooms",
         duration_s=duration_s,
-        rate_hz=10.0,
+        rate_hz=rate_hz,
         seed=seed,
         world_seed=7,
         cameras=cameras,
@@ -34,7 +34,7 @@ def test_loops_join_a_segment_with_the_one_before(
     cameras: int, alignment: str, bound: float
 ) -> None:
     """In six degrees of freedom, or seven where each segment has a scale of its own."""
-    sequence = flight(cameras, 1, 60.0)  # it comes back after 40 s
+    sequence = flight(cameras, 1, 60.0, 5.0)  # it comes back after 40 s
     settings = {**CAUSAL, "loop_closure.enabled": True}
     result = run(inject(sequence, [LOST.format(25)]), algorithm="msckf", overrides=settings)
     assert result.status == "ok"

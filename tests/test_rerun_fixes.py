@@ -32,11 +32,11 @@ from slam_graph.visualization.rerun_palette import ORANGE, VERMILLION
 from slam_graph.visualization.rerun_stream import RerunStream
 
 
-def drive() -> Sequence:
+def drive(duration_s: float = 40.0) -> Sequence:
     """A car without an IMU, every fifth of whose fixes is off by 10 m."""
     return sg.simulate(
         trajectory="car",
-        duration_s=40.0,
+        duration_s=duration_s,
         with_imu=False,
         seed=1,
         tracks={"features": 60},
@@ -105,7 +105,7 @@ def test_fixes_that_the_gate_rejects_are_red(
 def test_without_use_of_the_fixes_none_are_shown(tmp_path: Path) -> None:
     viewer = RerunRecording("save", "unused", tmp_path / "unused.rrd").viewer()
     off = {"backend.gnss.enabled": False, "final_ba.enabled": False}
-    result = sg.run(drive(), viewer=viewer, overrides=off)
+    result = sg.run(drive(10.0), viewer=viewer, overrides=off)
     assert not result.warnings["viewer_failed"]
     assert not any(FIXES in name.split("/") for name in rows_of(tmp_path / "unused.rrd"))
 
