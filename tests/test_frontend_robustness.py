@@ -23,6 +23,9 @@ from slam_graph.sensors.rig import Rig
 
 pytestmark = pytest.mark.data
 
+CAUSAL = ["final_ba.enabled=false"]
+"""What is smoothed in the end is not looked at here."""
+
 Image = NDArray[np.uint8]
 Edit = Callable[[Image, int, float], Image]
 """What is done to an image, given its camera and the seconds since the first frame."""
@@ -66,7 +69,7 @@ def folder(data_dir: Path) -> Path:
 
 @pytest.fixture(scope="module")
 def clean_m(folder: Path) -> float:
-    return ate_m(run(open_dataset(folder), load_config(duration_s=8)))
+    return ate_m(run(open_dataset(folder), load_config(overrides=CAUSAL, duration_s=8)))
 
 
 def ate_m(result: RunResult) -> float:
@@ -91,7 +94,9 @@ def test_a_run_survives_dark_saturated_blurred_and_blank_images(folder: Path) ->
         return image
 
     kept = Kept()
-    result = run(Edited(folder, spoil), load_config(duration_s=10.5), recorder=kept)
+    result = run(
+        Edited(folder, spoil), load_config(overrides=CAUSAL, duration_s=10.5), recorder=kept
+    )
     assert ate_m(result) < 0.0105
     assert result.coverage > 0.8
     assert result.warnings["few_features"] > 0
@@ -116,7 +121,7 @@ def test_random_matches_do_little_harm(
         return Association(points, found.good | wrong, lost)
 
     monkeypatch.setattr(CornerTracking, "follow", spoilt)
-    result = run(open_dataset(folder), load_config(duration_s=8))
+    result = run(open_dataset(folder), load_config(overrides=CAUSAL, duration_s=8))
     assert result.logs.features["rejected_ransac"] > 0.15 * result.logs.features["tracked"]
     assert ate_m(result) < 2.0 * clean_m
 
@@ -157,14 +162,14 @@ def test_a_moving_wall_does_little_harm(folder: Path, clean_m: float, since_s: f
     wall = MovingWall(open_dataset(folder).rig, since_s)
     black = wall(np.zeros((480, 752), np.uint8), 0, 5.0)
     assert 0.25 < np.mean(black > 0) < 0.4
-    result = run(Edited(folder, wall), load_config(duration_s=8))
+    result = run(Edited(folder, wall), load_config(overrides=CAUSAL, duration_s=8))
     assert (result.trajectory.stamps_ns[0] - result.input.start_ns) * 1e-9 < 2.0
     assert ate_m(result) < 1.65 * clean_m
 
 
 def test_a_process_for_the_front_end_changes_nothing(folder: Path) -> None:
     """Not even where the front end hears of the back end in every frame."""
-    changes = ["frontend.prediction=state", "frontend.drop_rejected=true"]
+    changes = [*CAUSAL, "frontend.prediction=state", "frontend.drop_rejected=true"]
     changes += ["frontend.map_check_px=3", "frontend.outliers=gyroscope", "min_coverage=0"]
     runs = []
     for overlap in ("true", "false"):

@@ -138,7 +138,7 @@ def test_an_interrupted_simulation_leaves_nothing_behind(
 
 
 def ate(sequence: SimulatedSequence) -> float:
-    given = ["backend.initialization.mode=given"]
+    given = ["backend.initialization.mode=given", "final_ba.enabled=false"]
     result = run(sequence, load_config(algorithm="msckf", overrides=given))
     result.check()
     assert result.start_was_given
