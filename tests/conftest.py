@@ -26,8 +26,9 @@ def pytest_sessionstart(session: pytest.Session) -> None:
 
 
 LONGEST = (
-    "position_fixes", "verdict", "recovery", "notebooks", "without_imu", "repeats", "policy_nees",
-    "clock_monitor", "estimator_end_to_end", "documented_start", "known_poses", "clock_windows",
+    "notebooks", "diagnosis", "verdict", "recovery", "documented_methods", "experiment",
+    "damaged_files", "position_fixes", "policy_product", "without_imu", "batch", "clock_monitor",
+    "documented_start", "documented_recordings", "map_runs", "documented_commands",
 )  # fmt: skip
 """Files of tests that take a minute or two each; they run first, so that no core ends with one."""
 

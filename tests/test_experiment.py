@@ -5,6 +5,7 @@
 import json
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -333,14 +334,20 @@ def test_a_dask_cluster_does_the_same(
     assert row["ate_m"] == pytest.approx(local["ate_m"], rel=1e-9)
 
 
+@pytest.fixture(scope="module")
+def long_flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A recording that is not done when the command ends."""
+    return flight(tmp_path_factory.mktemp("long") / "flight", 0, 60.0)
+
+
 @pytest.mark.parametrize("by", [signal.SIGINT, signal.SIGKILL], ids=["ctrl_c", "killed"])
 def test_processes_that_workers_have_started_end_with_the_command(
-    scheduler: str, tmp_path: Path, by: signal.Signals
+    scheduler: str, long_flight: Path, tmp_path: Path, by: signal.Signals
 ) -> None:
     """Also where the command is killed: Dask then forgets its tasks."""
     pytest.importorskip("distributed")
     for seed in range(2):
-        flight(tmp_path / "data" / f"flight_{seed}", seed, 60.0)
+        shutil.copytree(long_flight, tmp_path / "data" / f"flight_{seed}")
     out = tmp_path / "out"
     process = subprocess.Popen(
         batch(tmp_path / "data", "--output", out, "--scheduler", scheduler, "--no-final-ba"),
@@ -414,7 +421,7 @@ def test_fixes_that_lie_elsewhere_are_compared_with(here: None, tmp_path: Path) 
     """Named as a source they are recorded with the tracks; changed ones are recorded anew."""
     drive, fixes = tmp_path / "drive", tmp_path / "fixes.csv"
     settings = {"with_imu": False, "seed": 1, "tracks": {"features": 60}}
-    simulate(trajectory="car", duration_s=25.0, gnss={"sigma_m": 0.3}, **settings).save(drive)
+    simulate(trajectory="car", duration_s=15.0, gnss={"sigma_m": 0.3}, **settings).save(drive)
     (drive / "gnss.csv").rename(fixes)
     arguments = {"sources": {"gnss": str(fixes)}, "workers": 1, "output": tmp_path / "compared"}
     done = compare_algorithms(drive, "msckf", **arguments)
