@@ -101,10 +101,9 @@ class Estimator(EstimatorKnowledge):
         self.aiding = Aiding(config, rig.has_imu, algorithm.engine == "square_root")
         self._given: NavState | None = None
         self._before: NavState | None = None
-        self._measured = True
         self._held: deque[FeatureFrame] | None = None
-        self._corrected = False
-        self._output_ns = np.iinfo(np.int64).min
+        self._measured, self._corrected = True, False
+        self._output_ns = self.solved_ns = np.iinfo(np.int64).min
         self.report = StepReport()
         self._single_thread = SingleThread()
         self.rig, self.algorithm, self.config = rig, algorithm, config
@@ -112,7 +111,6 @@ class Estimator(EstimatorKnowledge):
         self.diagnostics = diagnostics
         self.replayed: list[NavState] | None = None
         self.states: list[NavState] = []
-        self.solved_ns = np.iinfo(np.int64).min
         self._begin(ImuBuffer())
 
     def _begin(self, imu: ImuBuffer) -> None:
@@ -277,7 +275,7 @@ class Estimator(EstimatorKnowledge):
             self.window = self._try_to_start(stamp_ns, frame)
         elif stamp_ns > self.window.stamp_ns:
             stepped = self._engine.step(self.window, stamp_ns, frame, still_sigma, self.report)
-            return self._reviewed(stamp_ns, whole, self._dynamics.reported(stepped))
+            return self._reviewed(whole, self._dynamics.reported(stepped), still_sigma is not None)
         elif stamp_ns == self.window.stamp_ns:
             self._context.add_observations(self.window, frame)
         if self.window is None or stamp_ns < self.window.stamp_ns:
@@ -349,20 +347,22 @@ class Estimator(EstimatorKnowledge):
             self._context.note(frame)
         return window
 
-    def _reviewed(self, stamp_ns: int, frame: FeatureFrame, state: NavState) -> NavState:
-        """The state, or that of a new beginning if what followed the start contradicts it."""
+    def _reviewed(self, frame: FeatureFrame, state: NavState, still: bool) -> NavState:
+        """The state, or that of a new window if what followed the start leads to one."""
         if not self._start_up.doubtful:
             return state
         with self.report.timed("start"):
-            window = self._start_up.better(stamp_ns, frame, state)
+            window = self._start_up.better(frame, self._standstill.dynamic, state, still)
         if window is None:
             return state
         self._standstill.dynamic = self._start_up.outliers
         self.window, self._engine = window, self._make_engine(self._context)
         self._context.propagation.restart()
         self.aiding.restart()
-        self.replayed = self.states = [self.window.current(self.window.prior)]
-        return self.replayed[0]
+        state = window.current(window.prior)
+        if self._start_up.contradicted:
+            self.replayed = self.states = [state]
+        return state
 
     def exclude(self, ids: IntArray) -> None:
         """Do not use features (N,) any more: they move. What is in the prior of them stays."""

@@ -209,14 +209,15 @@ class CostConstruction:
         that are kept for when they are seen again would come back at once, and go on.
         """
         waiting = window.tracks.ids_waiting()
-        ids = window.state_features[is_in(window.state_features, waiting)]
+        ids: IntArray = window.state_features[is_in(window.state_features, waiting)]
         if self.policy.keep_lost_features:
             return ids
         state = window.state
         points, first = state.positions_of(ids), state.positions_of(ids, first=True)
         here = state.frames.atPose3(X(window.frame)).translation()
         moved, away = (np.add.reduce((points - p) ** 2, axis=1) for p in (first, here))
-        return ids[moved <= MAX_MOVED**2 * away]
+        near: IntArray = ids[moved <= MAX_MOVED**2 * away]
+        return near
 
     def _selected_poses(self, window: Window) -> PoseSelection:
         poses = self._select_poses(window, self.policy, self.rig)

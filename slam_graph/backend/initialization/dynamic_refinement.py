@@ -16,7 +16,7 @@ import numpy as np
 from gtsam.symbol_shorthand import L, V, X
 
 from slam_graph.arrays import BoolArray, IntArray
-from slam_graph.backend.backend_config import PriorConfig, UnknownScale
+from slam_graph.backend.backend_config import PriorConfig
 from slam_graph.backend.cost.adaptive_imu_noise import MotionChange
 from slam_graph.backend.cost.cost import Cost, Linearization, TrackFeatures
 from slam_graph.backend.cost.feature_factors import SummedFeatures
@@ -31,7 +31,7 @@ from slam_graph.backend.initialization.dynamic_start import (
     StartFrames,
     StartGuess,
 )
-from slam_graph.backend.initialization.first_state import fix_gauge, prior_covariance
+from slam_graph.backend.initialization.first_state import fix_gauge, prior_covariance, prior_of
 from slam_graph.backend.initialization.start_diagnosis import MIN_FEATURES, Refusal
 from slam_graph.backend.marginalization.marginalize import (
     LinearizationPoints,
@@ -93,27 +93,31 @@ class DynamicRefinement:
         scale_sigma: relative standard deviation of the scale of the last solution.
     """
 
-    def __init__(self, context: EngineContext, unknown_scale: UnknownScale) -> None:
+    def __init__(self, context: EngineContext, max_scale_sigma: float) -> None:
         """Prepare for attempts.
 
         Args:
             context: shared with the engine.
-            unknown_scale: as in `initialization.unknown_scale`.
+            max_scale_sigma: largest accepted standard deviation of the scale, relative to it.
         """
         self.outliers = np.zeros(0, np.int64)
         self.scale_sigma = float("inf")
         self._context = context
-        self._max_scale_sigma = MAX_SCALE_SIGMA if unknown_scale == "wait" else ROUGH_SCALE_SIGMA
+        self._max_scale_sigma = max_scale_sigma
 
-    def refine(self, frames: StartFrames, guess: StartGuess) -> Window | Refusal:
+    def refine(
+        self, frames: StartFrames, guess: StartGuess, first: NavState | None = None
+    ) -> Window | Refusal:
         """The window that begins with the last frame, or what is missing for it.
 
         Args:
             frames: what they observed.
             guess: their states, and which features are static.
+            first: the state at the first frame with its covariance, if it is known. The window is
+                in its world then; else in one that the last frame defines.
         """
         lasting = _lasting(frames)
-        cost = self._batch_cost(frames, guess, lasting)
+        cost = self._batch_cost(frames, guess, lasting, first)
         try:
             linear = cost.linearize(summed=True)
             hopeless = self._hopeless(cost, linear, len(guess.static))
@@ -142,11 +146,13 @@ class DynamicRefinement:
         if self._context.algorithm.marginalization.first_estimates:
             points = "first"
         prior = marginalize(posterior, cost.state, keep, points)
+        if first is None:
+            prior = self._in_gauge(prior, cost.state, last, features)
         start = Window(
             last,
             frames.stamps_ns[-1],
             cost.state,
-            self._in_gauge(prior, cost.state, last, features),
+            prior,
             state_features=features,
             calibration=calibration,
         )
@@ -223,14 +229,20 @@ class DynamicRefinement:
             return Refusal("motion", needs)
         return None
 
-    def _batch_cost(self, frames: StartFrames, guess: StartGuess, obs: Observations) -> BatchCost:
+    def _batch_cost(
+        self, frames: StartFrames, guess: StartGuess, obs: Observations, first: NavState | None
+    ) -> BatchCost:
         """All states of the window, a prior on the first, and the static features they see."""
         context = self._context
         state = State()
         for k, nav in enumerate(guess.states):
             state.insert_imu_state(k, nav)
-        factors = self._factors(frames, guess)
-        known = context.calibration.enter(state, SquareRootInformation.empty())
+        if first is None:
+            factors, known = self._factors(frames, guess), SquareRootInformation.empty()
+        else:
+            factors, known = self._dynamics(frames, guess), prior_of(first)
+            state.freeze(imu_state_keys(0))
+        known = context.calibration.enter(state, known)
         for k, (stamp_ns, frame) in enumerate(zip(frames.stamps_ns, frames.frames, strict=True)):
             context.calibration.note_motion(state, k, stamp_ns, frame.stamp_ns, context.imu)
         loss = RobustLoss(context.config.gating.loss)
@@ -241,6 +253,12 @@ class DynamicRefinement:
 
     def _factors(self, frames: StartFrames, guess: StartGuess) -> list[gtsam.NonlinearFactor]:
         """The dynamics from frame to frame, and a prior on the first state."""
+        first = replace(guess.states[0], covariance=prior_covariance(MOTION_PRIOR))
+        prior = prior_factors(fix_gauge(first, MOTION_PRIOR))
+        return self._dynamics(frames, guess) + prior
+
+    def _dynamics(self, frames: StartFrames, guess: StartGuess) -> list[gtsam.NonlinearFactor]:
+        """The dynamics from frame to frame."""
         context, start = self._context, guess.states[0]
         factors: list[gtsam.NonlinearFactor] = []
         bias = gtsam.imuBias.ConstantBias(start.accel_bias, start.gyro_bias)
@@ -252,8 +270,7 @@ class DynamicRefinement:
             scale = IMU_GAP_SCALE if gap_s > context.config.noise.max_imu_gap_s else 1.0
             params = noise.params(scale, _WHITE_NOISE_FACTOR, change)
             factors.append(imu_factor(k, k + 1, samples.preintegrated(bias, params)))
-        first = replace(start, covariance=prior_covariance(MOTION_PRIOR))
-        return factors + prior_factors(fix_gauge(first, MOTION_PRIOR))
+        return factors
 
     def _refine_motions(self, cost: Cost, frames: StartFrames) -> None:
         """Take the velocities of the solution for the motion between rows of rolling shutters."""

@@ -14,7 +14,11 @@ from slam_graph.arrays import IntArray
 from slam_graph.backend.backend_config import UnknownScale
 from slam_graph.backend.cost.zero_velocity import StandstillDetector
 from slam_graph.backend.engine_protocol import EngineContext
-from slam_graph.backend.initialization.dynamic_refinement import DynamicRefinement
+from slam_graph.backend.initialization.dynamic_refinement import (
+    MAX_SCALE_SIGMA,
+    ROUGH_SCALE_SIGMA,
+    DynamicRefinement,
+)
 from slam_graph.backend.initialization.dynamic_start import (
     StartFrames,
     guess_states,
@@ -74,7 +78,9 @@ class Initializer:
         self._context = context
         self._config = context.config.initialization
         self._mode = mode
-        self._refinement = DynamicRefinement(context, unknown_scale or self._config.unknown_scale)
+        waits = (unknown_scale or self._config.unknown_scale) == "wait"
+        sigma = MAX_SCALE_SIGMA if waits else ROUGH_SCALE_SIGMA
+        self._refinement = DynamicRefinement(context, sigma)
         self._stamps_ns: list[int] = []
         self._frames: list[FeatureFrame] = []
         self._tried_ns, self._in_vain = 0, 0

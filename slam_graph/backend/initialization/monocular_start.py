@@ -31,6 +31,7 @@ from slam_graph.backend.engine_protocol import EngineContext
 from slam_graph.backend.initialization.batch_cost import BatchCost
 from slam_graph.backend.initialization.dynamic_refinement import (
     MAX_NORMALIZED_COST,
+    MAX_SCALE_SIGMA,
     MAX_STEP_LEFT,
     DynamicRefinement,
     prior_factors,
@@ -164,7 +165,7 @@ class ScaleFreeRefinement(DynamicRefinement):
     """The batch problem of a start without an IMU, whose scale is a convention."""
 
     def __init__(self, context: EngineContext) -> None:
-        super().__init__(context, "wait")
+        super().__init__(context, MAX_SCALE_SIGMA)
 
     def _hope(self, cost: BatchCost) -> None:
         """All steps are taken: without an IMU attempts that fail are rare."""

@@ -12,6 +12,7 @@ from slam_graph.backend.initialization.initializer import Initializer
 from slam_graph.backend.initialization.monocular_start import MonocularStart
 from slam_graph.backend.initialization.segment_joint import SegmentJoint, place
 from slam_graph.backend.initialization.start_review import StartReview
+from slam_graph.backend.initialization.take_off import TakeOff
 from slam_graph.backend.initialization.visual_start import VisualStart
 from slam_graph.backend.window import Window
 from slam_graph.geometry import NavState
@@ -24,7 +25,8 @@ class StartUp:
     Attributes:
         outliers: ids (N,) of the features that did not fit the last start, ascending.
         joint: how the start continues a segment before; None in the first.
-        doubtful: whether the start is still reviewed.
+        doubtful: whether the start is still looked at again.
+        contradicted: whether the last new window contradicts the states before.
     """
 
     def __init__(
@@ -40,12 +42,13 @@ class StartUp:
         """
         self.outliers: IntArray = np.zeros(0, np.int64)
         self.joint: SegmentJoint | None = None
-        self.doubtful = False
+        self.doubtful = self.contradicted = False
         self._context, self._before, self._measured = context, before, measured
         self._inertial = Initializer(context, mode) if context.rig.has_imu else None
         alone = len(context.rig.cameras) == 1
         self._visual = MonocularStart(context) if alone else VisualStart(context)
         self._review: StartReview | None = None
+        self._take_off: TakeOff | None = None
 
     def try_to_start(self, stamp_ns: int, frame: FeatureFrame) -> Window | None:
         """The first window, if this frame makes a start possible.
@@ -63,31 +66,53 @@ class StartUp:
             scale_sigma = self._inertial.scale_sigma
             self._review = StartReview(self._context, stamp_ns, scale_sigma)
             self.doubtful = True
+            if scale_sigma is None and len(self._context.rig.cameras) == 1:
+                self._take_off = TakeOff(self._context)
         window = self._placed(window)
         if search.leaves_frame:
             self._context.add_observations(window, frame)
         return window
 
-    def better(self, stamp_ns: int, frame: FeatureFrame, state: NavState) -> Window | None:
-        """A new first window, if what followed a doubtful start contradicts it.
+    def better(
+        self, frame: FeatureFrame, dynamic: IntArray, state: NavState, still: bool
+    ) -> Window | None:
+        """A new window, if what followed a start tells more of it, or contradicts it.
 
         Args:
-            stamp_ns: time of the frame on the clock of the IMU.
-            frame: its features.
-            state: the estimate then.
+            frame: features of the current frame.
+            dynamic: ids (N,) of those that are known to move, ascending.
+            state: the estimate then, on the clock of the IMU.
+            still: whether the platform stands still.
         """
-        review = self._review
-        assert review is not None
-        window = review.better(stamp_ns, frame, state)
-        self.doubtful = not review.done
-        if window is None:
+        window, self.contradicted = self._first_motion(frame, dynamic, state, still), False
+        if window is None and self._review is not None:
+            window = self._review.better(state.stamp_ns, frame, state)
+            if window is not None:
+                self.outliers, self.contradicted = self._review.outliers, True
+                self._take_off, window = None, self._placed(window)
+            if self._review.done:
+                self._review = None
+        # what compares the frame with the states before must not do so across a new window
+        waiting = self._take_off is not None or self._review is not None
+        self.doubtful = waiting or window is not None
+        return window
+
+    def _first_motion(
+        self, frame: FeatureFrame, dynamic: IntArray, state: NavState, still: bool
+    ) -> Window | None:
+        """A new window in the same world, once the first motion after a standstill is solved."""
+        if self._take_off is None:
             return None
-        self.outliers = review.outliers
-        return self._placed(window)
+        window = self._take_off.solved(frame.without(dynamic), state, still)
+        if window is not None:
+            self.outliers, self._review = self._take_off.outliers, None
+        if self._take_off.done:
+            self._take_off = None
+        return window
 
     def settle(self) -> None:
         """The place of the segment is measured: nothing of its start is in doubt any more."""
-        self.doubtful, self._review = False, None
+        self.doubtful, self._review, self._take_off = False, None, None
         self.joint = None if self.joint is None else self.joint.superseded()
 
     def waiting_for(self, calibration: str | None) -> str:

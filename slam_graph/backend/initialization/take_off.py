@@ -1,0 +1,91 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""The first motion of one camera after a standstill, solved again as a batch problem.
+
+A camera that stands still knows no distances. In the first motion scale and depths become known
+together, beginning far from where they end, and a filter linearises each frame only once: at a
+scale that is a fifth off it becomes sure of a wrong one. So all states since the standstill are
+solved again together as soon as that determines the scale, and the estimator goes on from there.
+The world stays the same, and so do the states before.
+"""
+
+from __future__ import annotations
+
+from slam_graph.arrays import IntArray
+from slam_graph.backend.engine_protocol import EngineContext
+from slam_graph.backend.initialization.dynamic_refinement import DynamicRefinement
+from slam_graph.backend.initialization.dynamic_start import StartFrames, StartGuess
+from slam_graph.backend.initialization.initializer import RETRY_S
+from slam_graph.backend.initialization.start_diagnosis import Refusal
+from slam_graph.backend.window import Window
+from slam_graph.geometry import NavState
+from slam_graph.sensors import FeatureFrame
+
+_SHORTEST_S, _LONGEST_S = 1.0, 5.0
+"""How long after the standstill the motion is solved at the earliest, and at the latest."""
+_MAX_SCALE_SIGMA = 0.03
+"""Largest standard deviation of the scale with which the estimator goes on, relative to it."""
+_SPACING_S = 0.1
+"""Time between the frames of the batch problem."""
+_MIN_FRAMES = 3
+"""Features that fewer of them see are not used."""
+
+
+class TakeOff:
+    """Collects the states and frames since the last standstill, and solves them again.
+
+    Attributes:
+        done: whether the motion has been solved, or has taken too long.
+    """
+
+    def __init__(self, context: EngineContext) -> None:
+        """Begin at rest.
+
+        Args:
+            context: shared with the engine.
+        """
+        self.done = False
+        self._refinement = DynamicRefinement(context, _MAX_SCALE_SIGMA)
+        self._states: list[NavState] = []
+        self._frames: list[FeatureFrame] = []
+        self._tried_ns = 0
+
+    @property
+    def outliers(self) -> IntArray:
+        """Ids (N,) of the features that did not fit the solution, ascending."""
+        return self._refinement.outliers
+
+    def solved(self, frame: FeatureFrame, state: NavState, still: bool) -> Window | None:
+        """The window to go on from, once the motion since the standstill tells the scale.
+
+        Args:
+            frame: features of the current frame, without those that are known to move.
+            state: the estimate then, with its covariance.
+            still: whether the platform stands still.
+        """
+        if still:
+            self._states, self._frames = [], []
+        self._states.append(state)
+        self._frames.append(frame)
+        first_ns, now_ns = self._states[0].stamp_ns, state.stamp_ns
+        self.done = now_ns - first_ns > round(_LONGEST_S * 1e9)
+        early = now_ns - first_ns < round(_SHORTEST_S * 1e9)
+        if self.done or early or now_ns - self._tried_ns < round(RETRY_S * 1e9):
+            return None
+        self._tried_ns = now_ns
+        window = self._solution()
+        self.done = window is not None
+        return window
+
+    def _solution(self) -> Window | None:
+        stamps_ns = [state.stamp_ns for state in self._states]
+        frames = StartFrames.thinned(stamps_ns, self._frames, _SPACING_S)
+        if frames.stamps_ns[0] != stamps_ns[0]:
+            with_first = [stamps_ns[0], *frames.stamps_ns], [self._frames[0], *frames.frames]
+            frames = StartFrames(*with_first)
+        chosen = set(frames.stamps_ns)
+        states = [state for state in self._states if state.stamp_ns in chosen]
+        ids, lengths = frames.tracks.lengths()
+        guess = StartGuess(states, ids[lengths >= _MIN_FRAMES])
+        found = self._refinement.refine(frames, guess, first=states[0])
+        return None if isinstance(found, Refusal) else found
