@@ -159,7 +159,7 @@ def test_a_failure_of_the_clock_watch_costs_no_diagnosis(monkeypatch: pytest.Mon
         raise ValueError("no clocks")
 
     monkeypatch.setattr(clock_watch.ClockWatch, "finish", fails)
-    result = run(flown(with_longer_lenses, duration_s=12.0), overrides=CAUSAL)
+    result = run(flown(with_longer_lenses), overrides=CAUSAL)
     assert result.warnings["diagnosis_failed"] == 1
     assert result.status == "suspect", result.message
     assert "calibrated focal length is 1." in result.message

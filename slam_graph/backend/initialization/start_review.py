@@ -23,6 +23,7 @@ from slam_graph.backend.initialization.dynamic_refinement import MAX_SCALE_SIGMA
 from slam_graph.backend.initialization.initializer import Initializer
 from slam_graph.backend.marginalization.marginalize import UP
 from slam_graph.backend.window import Window
+from slam_graph.diagnostics import Diagnostics
 from slam_graph.geometry import NavState
 from slam_graph.sensors import FeatureFrame
 
@@ -93,12 +94,14 @@ class StartReview:
         self.done = True
         if not contradict(state, window.current(window.prior), not self._from_standstill):
             return None
-        seconds = (stamp_ns - self._begun_ns) * 1e-9
-        self._diagnostics.warn(
-            "start_corrected",
-            f"what follows the start contradicts it; solved again {seconds:.1f} s later",
-        )
+        warn_of_correction(self._diagnostics, stamp_ns - self._begun_ns)
         return window
+
+
+def warn_of_correction(diagnostics: Diagnostics, since_ns: int) -> None:
+    """Count a start that was wrong, and say how long after it that was found."""
+    message = f"what follows the start contradicts it; solved again {since_ns * 1e-9:.1f} s later"
+    diagnostics.warn("start_corrected", message)
 
 
 def contradict(one: NavState, other: NavState, by_much: bool = True) -> bool:

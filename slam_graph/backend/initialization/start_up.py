@@ -11,7 +11,11 @@ from slam_graph.backend.engine_protocol import EngineContext
 from slam_graph.backend.initialization.initializer import Initializer
 from slam_graph.backend.initialization.monocular_start import MonocularStart
 from slam_graph.backend.initialization.segment_joint import SegmentJoint, place
-from slam_graph.backend.initialization.start_review import StartReview
+from slam_graph.backend.initialization.start_review import (
+    StartReview,
+    contradict,
+    warn_of_correction,
+)
 from slam_graph.backend.initialization.take_off import TakeOff
 from slam_graph.backend.initialization.visual_start import VisualStart
 from slam_graph.backend.window import Window
@@ -84,7 +88,8 @@ class StartUp:
             state: the estimate then, on the clock of the IMU.
             still: whether the platform stands still.
         """
-        window, self.contradicted = self._first_motion(frame, dynamic, state, still), False
+        self.contradicted = False
+        window = self._first_motion(frame.without(dynamic), state, still)
         if window is None and self._review is not None:
             window = self._review.better(state.stamp_ns, frame, state)
             if window is not None:
@@ -97,16 +102,18 @@ class StartUp:
         self.doubtful = waiting or window is not None
         return window
 
-    def _first_motion(
-        self, frame: FeatureFrame, dynamic: IntArray, state: NavState, still: bool
-    ) -> Window | None:
+    def _first_motion(self, frame: FeatureFrame, state: NavState, still: bool) -> Window | None:
         """A new window in the same world, once the first motion after a standstill is solved."""
-        if self._take_off is None:
+        take_off = self._take_off
+        if take_off is None:
             return None
-        window = self._take_off.solved(frame.without(dynamic), state, still)
+        window = take_off.solved(frame, state, still)
         if window is not None:
-            self.outliers, self._review = self._take_off.outliers, None
-        if self._take_off.done:
+            self.outliers, self._review = take_off.outliers, None
+            self.contradicted = contradict(state, window.current(window.prior), by_much=False)
+            if self.contradicted:
+                warn_of_correction(self._context.diagnostics, take_off.length_ns)
+        if take_off.done:
             self._take_off = None
         return window
 

@@ -6,7 +6,7 @@ A camera that stands still knows no distances. In the first motion scale and dep
 together, beginning far from where they end, and a filter linearises each frame only once: at a
 scale that is a fifth off it becomes sure of a wrong one. So all states since the standstill are
 solved again together as soon as that determines the scale, and the estimator goes on from there.
-The world stays the same, and so do the states before.
+The world stays the same, and so do the states before if the solution does not contradict them.
 """
 
 from __future__ import annotations
@@ -55,6 +55,11 @@ class TakeOff:
         """Ids (N,) of the features that did not fit the solution, ascending."""
         return self._refinement.outliers
 
+    @property
+    def length_ns(self) -> int:
+        """Time since the standstill."""
+        return self._states[-1].stamp_ns - self._states[0].stamp_ns
+
     def solved(self, frame: FeatureFrame, state: NavState, still: bool) -> Window | None:
         """The window to go on from, once the motion since the standstill tells the scale.
 
@@ -67,12 +72,11 @@ class TakeOff:
             self._states, self._frames = [], []
         self._states.append(state)
         self._frames.append(frame)
-        first_ns, now_ns = self._states[0].stamp_ns, state.stamp_ns
-        self.done = now_ns - first_ns > round(_LONGEST_S * 1e9)
-        early = now_ns - first_ns < round(_SHORTEST_S * 1e9)
-        if self.done or early or now_ns - self._tried_ns < round(RETRY_S * 1e9):
+        self.done = self.length_ns > round(_LONGEST_S * 1e9)
+        early = self.length_ns < round(_SHORTEST_S * 1e9)
+        if self.done or early or state.stamp_ns - self._tried_ns < round(RETRY_S * 1e9):
             return None
-        self._tried_ns = now_ns
+        self._tried_ns = state.stamp_ns
         window = self._solution()
         self.done = window is not None
         return window
