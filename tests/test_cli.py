@@ -75,6 +75,11 @@ assert set(dir(slam_graph)) == set(slam_graph.__all__)
     subprocess.run([sys.executable, "-c", script], check=True, timeout=HANG_S)
 
 
+def test_little_is_imported_before_signals_are_minded() -> None:
+    script = "import sys, slam_graph.cli.launch; assert 'typing' not in sys.modules"
+    subprocess.run([sys.executable, "-c", script], check=True, timeout=HANG_S)
+
+
 def test_version() -> None:
     done = slam_graph("--version")
     assert (done.returncode, done.stdout) == (0, f"slam-graph {__version__}\n")

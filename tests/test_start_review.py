@@ -15,6 +15,7 @@ from slam_graph.backend import Estimator
 from slam_graph.backend.cost.adaptive_imu_noise import DynamicsNoise
 from slam_graph.backend.initialization import start_review
 from slam_graph.backend.initialization.start_review import StartReview, contradict
+from slam_graph.backend.initialization.take_off import TakeOff
 from slam_graph.config import load_config
 from slam_graph.evaluation import ape
 from slam_graph.geometry import NavState, StateHistory
@@ -142,8 +143,20 @@ def test_a_start_without_a_metre_scale_is_a_choice() -> None:
     assert abs(scale - 1.0) < 0.05
 
 
-def test_a_start_from_standstill_that_moves_off_slowly_is_reviewed(data_dir: Path) -> None:
-    """One camera says nothing for 1.5 s, and the first step of its features comes from far away."""
+@pytest.mark.parametrize("solved", [True, False])
+def test_a_start_from_standstill_that_moves_off_slowly_is_corrected(
+    solved: bool, data_dir: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One camera says nothing for 1.5 s, and the first step of its features comes from far away.
+
+    The first motion is solved again. Where that is given up, the review acts.
+    """
+
+    def gives_up(take_off: TakeOff, *_: object) -> None:
+        take_off.done = True
+
+    if not solved:
+        monkeypatch.setattr(TakeOff, "solved", gives_up)
     handheld = {"tracks": {"features": 150, "pixel_sigma": 1.0}, "seed": 1}
     path = str(data_dir / "tumvi_inertial/room1")
     sequence = simulate(trajectory=path, cameras=1, duration_s=12.0, rate_hz=20.0, **handheld)

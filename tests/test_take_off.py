@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """One camera that takes off: the first motion is solved again once it tells the scale."""
 
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -12,11 +13,13 @@ from slam_graph.backend.initialization.take_off import TakeOff
 from slam_graph.evaluation import nees_of_run
 from slam_graph.simulation.simulated_sequence import SimulatedSequence
 
+STATIC = ["backend.initialization.mode=static"]
+
 
 def error_and_nees(sequence: SimulatedSequence) -> tuple[float, float]:
     """Error of the causal position (m), and its mean NEES."""
-    settings = ["backend.initialization.mode=static", "final_ba.enabled=false"]
-    run = sg.run(sequence, algorithm="msckf", overrides=settings)
+    overrides = [*STATIC, "final_ba.enabled=false"]
+    run = sg.run(sequence, algorithm="msckf", overrides=overrides)
     assert run.status == "ok"
     assert run.groundtruth is not None
     error = sg.ape(run.groundtruth, run.trajectory, alignment="yaw").statistics.rmse
@@ -45,26 +48,67 @@ def test_what_was_linearised_far_from_the_scale_is_solved_again(
     assert nees < 0.7 * nees_without
 
 
+def lift(**settings: object) -> SimulatedSequence:
+    """A flight of one camera that begins at rest."""
+    few = {"features": 80}
+    return sg.simulate(trajectory="figure8", cameras=1, rate_hz=10, seed=2, tracks=few, **settings)
+
+
+@dataclass
+class Lifted:
+    """What an estimator gave for each frame.
+
+    Attributes:
+        states: those that it reported.
+        solved: number of the state at which the first motion was solved again.
+        features: number of features in the state there.
+        doubtful: whether the start was doubtful before each.
+    """
+
+    states: list[sg.NavState] = field(default_factory=list)
+    solved: int | None = None
+    features: int = 0
+    doubtful: list[bool] = field(default_factory=list)
+
+
+def lifted(
+    estimator: sg.Estimator, sequence: SimulatedSequence, blank_s: tuple[float, ...] = ()
+) -> Lifted:
+    """Run an estimator, and look for the frame from which its window is numbered anew."""
+    found, before = Lifted(), -1
+    for packet in sequence.packets():
+        frame = packet.frame
+        seconds = (frame.stamp_ns - sequence.groundtruth().stamps_ns[0]) * 1e-9
+        if any(abs(seconds - blank) < 0.01 for blank in blank_s):
+            frame = frame.without(frame.cameras[0].ids)
+        estimator.add_imu(packet.imu)
+        found.doubtful.append(estimator.start_is_doubtful)
+        state = estimator.add_frame(frame)
+        assert estimator.replayed is None
+        if state is None:
+            continue
+        window = estimator.window
+        assert window is not None
+        if window.frame <= before:
+            assert found.solved is None, "once"
+            found.solved, found.features = len(found.states), len(window.state_features)
+        before = window.frame
+        found.states.append(state)
+    return found
+
+
+def estimator_for(sequence: SimulatedSequence, algorithm: str = "msckf") -> sg.Estimator:
+    told = sg.load_config(algorithm, STATIC)
+    return sg.Estimator(sequence.rig, told.algorithm, told.backend)
+
+
 def test_the_world_and_the_states_before_stay() -> None:
     """The state at the solution is within its own and the filter's covariance of that before."""
-    sequence = sg.simulate(
-        trajectory="figure8", cameras=1, rate_hz=10, duration_s=4, seed=2, tracks={"features": 80}
-    )
-    told = sg.load_config("msckf", ["backend.initialization.mode=static"])
-    estimator = sg.Estimator(sequence.rig, told.algorithm, told.backend)
-    states = []
-    for packet in sequence.packets():
-        estimator.add_imu(packet.imu)
-        doubtful = estimator.start_is_doubtful
-        state = estimator.add_frame(packet.frame)
-        assert estimator.replayed is None
-        if state is not None:
-            states.append((state, doubtful, estimator.window.frame if estimator.window else 0))
-    numbers = np.array([number for _, _, number in states])
-    (solved,) = np.flatnonzero(np.diff(numbers) != 1) + 1  # numbered anew, once
-    assert states[solved][1]
-    assert not states[-1][1]
-    (before, *_), (after, *_) = states[solved - 1 : solved + 1]
+    sequence = lift(duration_s=4)
+    found = lifted(estimator_for(sequence), sequence)
+    assert found.solved is not None
+    assert not found.doubtful[-1]
+    before, after = found.states[found.solved - 1 : found.solved + 1]
     assert before.covariance is not None
     assert after.covariance is not None
     seconds = (after.stamp_ns - before.stamp_ns) * 1e-9
@@ -72,3 +116,41 @@ def test_the_world_and_the_states_before_stay() -> None:
     jump = way - 0.5 * seconds * (before.velocity + after.velocity)
     sigma = np.sqrt(np.trace(before.covariance[3:6, 3:6]) + np.trace(after.covariance[3:6, 3:6]))
     assert np.linalg.norm(jump) < 4.0 * sigma
+
+
+def test_a_frame_without_features_is_not_what_the_window_begins_with() -> None:
+    sequence = lift(duration_s=4)
+    plain = lifted(estimator_for(sequence), sequence)
+    assert plain.solved is not None
+    stamp_ns = plain.states[plain.solved].stamp_ns
+    at_s = (stamp_ns - int(sequence.groundtruth().stamps_ns[0])) * 1e-9
+    found = lifted(estimator_for(sequence), sequence, (at_s, at_s + 0.1))
+    assert found.solved is not None
+    assert found.features >= 15
+
+
+def test_features_that_are_known_to_move_stay_so() -> None:
+    sequence = lift(duration_s=4)
+    estimator = estimator_for(sequence)
+    views = [packet.frame.cameras[0].ids for packet in sequence.packets()]
+    moving = views[0][:20]
+    estimator.exclude(moving)
+    assert lifted(estimator, sequence).solved is not None
+    tracked = np.intersect1d(moving, views[-1])
+    assert len(tracked)
+    assert np.isin(tracked, estimator.dynamic).all()
+
+
+def test_smoothers_are_left_alone() -> None:
+    sequence = lift(duration_s=4)
+    assert lifted(estimator_for(sequence, "fixed_lag_isam2"), sequence).solved is None
+
+
+def test_states_before_stay_where_fixes_tell_the_world(monkeypatch: pytest.MonkeyPatch) -> None:
+    sequence = lift(duration_s=10, gnss={"sigma_m": 0.05})
+    overrides = [*STATIC, "final_ba.enabled=false"]
+    result = sg.run(sequence, algorithm="msckf", overrides=overrides)
+    monkeypatch.setattr(TakeOff, "solved", lambda *_: None)
+    without = sg.run(sequence, algorithm="msckf", overrides=overrides)
+    assert result.georeferenced
+    assert len(result.trajectory) == len(without.trajectory)

@@ -146,7 +146,7 @@ class Estimator(EstimatorKnowledge):
         if state.covariance is None:
             raise EstimationError("a start state needs a covariance")
         state = self._given = state if with_rate else self._dynamics.given(state)
-        self._start_up.doubtful = False
+        self._start_up.trust()
         self._context.propagation.restart()
         self.window = start_from(state, self.config, self._context.calibration)
         self._engine = self._make_engine(self._context)  # nothing is left of an earlier start
@@ -358,9 +358,9 @@ class Estimator(EstimatorKnowledge):
         self._standstill.dynamic = self._start_up.outliers
         self.window, self._engine = window, self._make_engine(self._context)
         self._context.propagation.restart()
-        self.aiding.restart()
         state = window.current(window.prior)
         if self._start_up.contradicted:
+            self.aiding.restart()
             self.replayed = self.states = [state]
         return state
 

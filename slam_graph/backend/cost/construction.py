@@ -15,7 +15,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from gtsam.symbol_shorthand import L, X
+from gtsam.symbol_shorthand import L
 
 from slam_graph.arrays import BoolArray, IntArray, ascending_union
 from slam_graph.backend.backend_config import BackendConfig
@@ -47,8 +47,8 @@ from slam_graph.errors import EstimationError
 
 MAX_MOVED = 0.5
 """Features of the state that have moved from their linearisation point by more than this share of
-their distance are not measured again. Jacobians go as one over the distance: there they are up to
-twice as large as they should be."""
+their distance from the nearest camera are not measured again. Jacobians go as one over the
+distance: up to there they are at most twice as large as they should be."""
 _MAX_FAILURES = 3
 """Features that are outliers in this many consecutive frames are treated as dynamic."""
 
@@ -202,7 +202,7 @@ class CostConstruction:
         return cost
 
     def _measured_again(self, window: Window) -> IntArray:
-        """The features of the state that the current frame sees, ascending, and that still fit it.
+        """The features of the state, ascending, that the current frame sees and that are measured.
 
         Where an estimate is far from its linearisation point, the Jacobian there is wrong and would
         turn the platform. Such features leave the state, and their tracks start anew. Lost features
@@ -210,12 +210,14 @@ class CostConstruction:
         """
         waiting = window.tracks.ids_waiting()
         ids: IntArray = window.state_features[is_in(window.state_features, waiting)]
-        if self.policy.keep_lost_features:
+        if self.policy.keep_lost_features or not len(ids):
             return ids
         state = window.state
         points, first = state.positions_of(ids), state.positions_of(ids, first=True)
-        here = state.frames.atPose3(X(window.frame)).translation()
-        moved, away = (np.add.reduce((points - p) ** 2, axis=1) for p in (first, here))
+        (R,), (p,) = state.poses([window.frame])
+        eyes = p + self.rig.body_p_camera @ R.T
+        away = np.add.reduce((points[:, None] - eyes) ** 2, axis=2).min(axis=1)
+        moved = np.add.reduce((points - first) ** 2, axis=1)
         near: IntArray = ids[moved <= MAX_MOVED**2 * away]
         return near
 

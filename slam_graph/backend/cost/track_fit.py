@@ -33,7 +33,7 @@ from slam_graph.backend.solve.state import FrameMotion
 from slam_graph.geometry import NavState
 from slam_graph.sensors import FeatureFrame, Rig
 
-_SPAN_NS, _STEP_NS = 1_000_000_000, 250_000_000
+COMPARED_NS, _STEP_NS = 1_000_000_000, 250_000_000
 """Frames of the last second count, and of those only some: errors of a track change slowly."""
 _LEAST_FRAMES = 3
 """A track of fewer frames fits most motions."""
@@ -147,7 +147,7 @@ class TrackFit:
         self._poses.append(_Pose(now_ns, now, _parts(T), _parts(self._carried), motion))
         self._tracks.add(now, frame)
         self._count += 1
-        while self._poses[0].stamp_ns < now_ns - _SPAN_NS - _UNEVEN_NS:
+        while self._poses[0].stamp_ns < now_ns - COMPARED_NS - _UNEVEN_NS:
             self._poses.popleft()
         self._tracks.keep_frames([pose.index for pose in self._poses])
         ids, lengths = self._tracks.lengths()

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""Refinement of a start in motion: a batch problem over its frames, under the engine's own cost.
+"""Refinement of a start: a batch problem over its frames, under the engine's own cost.
 
 All states of the window and all features they see are estimated together by Levenberg-Marquardt,
 once more after outliers are removed; all but the last state is then marginalised. The result is
@@ -86,7 +86,7 @@ _BEST_FEATURES = 0.1
 
 
 class DynamicRefinement:
-    """The batch problem of a start in motion.
+    """The batch problem of a start in motion, or of the first motion after a standstill.
 
     Attributes:
         outliers: ids (N,) of the features that did not fit the last solution, ascending.
@@ -113,12 +113,12 @@ class DynamicRefinement:
         Args:
             frames: what they observed.
             guess: their states, and which features are static.
-            first: the state at the first frame with its covariance, if it is known. The window is
-                in its world then; else in one that the last frame defines.
+            first: the first of these states with its covariance, if it is known. The window is in
+                its world then; else in one that the last frame defines.
         """
         lasting = _lasting(frames)
-        cost = self._batch_cost(frames, guess, lasting, first)
         try:
+            cost = self._batch_cost(frames, guess, lasting, first)
             linear = cost.linearize(summed=True)
             hopeless = self._hopeless(cost, linear, len(guess.static))
             if hopeless is not None:

@@ -74,11 +74,12 @@ class StartFrames:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StartGuess:
-    """First estimates for the batch problem of a start in motion.
+    """First estimates for the batch problem of a start.
 
     Attributes:
-        states: of all frames; the first body is at the origin of the world with zero yaw.
-        static: ids (J,) of the static features that are tracked for long enough, ascending.
+        states: of all frames; in motion the first body is at the origin of the world with zero yaw.
+        static: ids (J,) of the features that are not known to move and are tracked for long enough,
+            ascending.
     """
 
     states: list[NavState]

@@ -7,8 +7,9 @@ a second time. If these contradict the estimate, the start was wrong, and the es
 the new solution. After a start without a metre scale this waits until the scale is known.
 
 A start from standstill is compared where its velocity became unknown before images said anything,
-as with one camera that moves off slowly: a filter's one step from so far away ends beside the
-minimum, and is sure of it. There also a small contradiction counts.
+as with one camera that moves off slowly and whose first motion could not be solved (`take_off.py`):
+a filter's one step from so far away ends beside the minimum, and is sure of it. There also a small
+contradiction counts.
 """
 
 from __future__ import annotations

@@ -6,7 +6,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from slam_graph.arrays import IntArray
+from slam_graph.arrays import IntArray, ascending_union
+from slam_graph.backend.cost.track_fit import COMPARED_NS
 from slam_graph.backend.engine_protocol import EngineContext
 from slam_graph.backend.initialization.initializer import Initializer
 from slam_graph.backend.initialization.monocular_start import MonocularStart
@@ -53,6 +54,7 @@ class StartUp:
         self._visual = MonocularStart(context) if alone else VisualStart(context)
         self._review: StartReview | None = None
         self._take_off: TakeOff | None = None
+        self._new_ns = -COMPARED_NS
 
     def try_to_start(self, stamp_ns: int, frame: FeatureFrame) -> Window | None:
         """The first window, if this frame makes a start possible.
@@ -70,7 +72,8 @@ class StartUp:
             scale_sigma = self._inertial.scale_sigma
             self._review = StartReview(self._context, stamp_ns, scale_sigma)
             self.doubtful = True
-            if scale_sigma is None and len(self._context.rig.cameras) == 1:
+            alone, engine = len(self._context.rig.cameras) == 1, self._context.algorithm.engine
+            if scale_sigma is None and alone and engine == "square_root":
                 self._take_off = TakeOff(self._context)
         window = self._placed(window)
         if search.leaves_frame:
@@ -88,28 +91,31 @@ class StartUp:
             state: the estimate then, on the clock of the IMU.
             still: whether the platform stands still.
         """
-        self.contradicted = False
-        window = self._first_motion(frame.without(dynamic), state, still)
-        if window is None and self._review is not None:
-            window = self._review.better(state.stamp_ns, frame, state)
-            if window is not None:
-                self.outliers, self.contradicted = self._review.outliers, True
-                self._take_off, window = None, self._placed(window)
-            if self._review.done:
-                self._review = None
-        # what compares the frame with the states before must not do so across a new window
+        self.contradicted, window = False, None
+        if self._take_off is not None:
+            window = self._first_motion(self._take_off, frame, dynamic, state, still)
+        elif self._review is not None:
+            window = self._reviewed(self._review, frame, state)
+        if window is not None and not self.contradicted:
+            # what compares frames with the states before must not do so across the new window
+            self._new_ns = state.stamp_ns
         waiting = self._take_off is not None or self._review is not None
-        self.doubtful = waiting or window is not None
+        self.doubtful = waiting or state.stamp_ns - self._new_ns <= COMPARED_NS
         return window
 
-    def _first_motion(self, frame: FeatureFrame, state: NavState, still: bool) -> Window | None:
+    def _first_motion(
+        self,
+        take_off: TakeOff,
+        frame: FeatureFrame,
+        dynamic: IntArray,
+        state: NavState,
+        still: bool,
+    ) -> Window | None:
         """A new window in the same world, once the first motion after a standstill is solved."""
-        take_off = self._take_off
-        if take_off is None:
-            return None
-        window = take_off.solved(frame, state, still)
+        window = take_off.solved(frame, dynamic, state, still)
         if window is not None:
-            self.outliers, self._review = take_off.outliers, None
+            self._review = None
+            self.outliers = ascending_union(dynamic, take_off.outliers)
             self.contradicted = contradict(state, window.current(window.prior), by_much=False)
             if self.contradicted:
                 warn_of_correction(self._context.diagnostics, take_off.length_ns)
@@ -117,9 +123,23 @@ class StartUp:
             self._take_off = None
         return window
 
-    def settle(self) -> None:
-        """The place of the segment is measured: nothing of its start is in doubt any more."""
+    def _reviewed(self, review: StartReview, frame: FeatureFrame, state: NavState) -> Window | None:
+        """A new window in another world, if what followed the start contradicts it."""
+        window = review.better(state.stamp_ns, frame, state)
+        if review.done:
+            self._review = None
+        if window is None:
+            return None
+        self.outliers, self.contradicted = review.outliers, True
+        return self._placed(window)
+
+    def trust(self) -> None:
+        """Nothing of the start is in doubt any more."""
         self.doubtful, self._review, self._take_off = False, None, None
+
+    def settle(self) -> None:
+        """The place of the segment is measured."""
+        self.trust()
         self.joint = None if self.joint is None else self.joint.superseded()
 
     def waiting_for(self, calibration: str | None) -> str:

@@ -16,7 +16,7 @@ from slam_graph.backend.engine_protocol import EngineContext
 from slam_graph.backend.initialization.dynamic_refinement import DynamicRefinement
 from slam_graph.backend.initialization.dynamic_start import StartFrames, StartGuess
 from slam_graph.backend.initialization.initializer import RETRY_S
-from slam_graph.backend.initialization.start_diagnosis import Refusal
+from slam_graph.backend.initialization.start_diagnosis import MIN_FEATURES, Refusal
 from slam_graph.backend.window import Window
 from slam_graph.geometry import NavState
 from slam_graph.sensors import FeatureFrame
@@ -25,14 +25,16 @@ _SHORTEST_S, _LONGEST_S = 1.0, 5.0
 """How long after the standstill the motion is solved at the earliest, and at the latest."""
 _MAX_SCALE_SIGMA = 0.03
 """Largest standard deviation of the scale with which the estimator goes on, relative to it."""
-_SPACING_S = 0.1
-"""Time between the frames of the batch problem."""
+_SPACING_S, _MOST_FRAMES = 0.1, 20
+"""Time between the frames of the batch problem; longer where there would be more of them."""
 _MIN_FRAMES = 3
 """Features that fewer of them see are not used."""
 
 
 class TakeOff:
     """Collects the states and frames since the last standstill, and solves them again.
+
+    Where no standstill is detected after the start, since the start.
 
     Attributes:
         done: whether the motion has been solved, or has taken too long.
@@ -60,11 +62,14 @@ class TakeOff:
         """Time since the standstill."""
         return self._states[-1].stamp_ns - self._states[0].stamp_ns
 
-    def solved(self, frame: FeatureFrame, state: NavState, still: bool) -> Window | None:
+    def solved(
+        self, frame: FeatureFrame, dynamic: IntArray, state: NavState, still: bool
+    ) -> Window | None:
         """The window to go on from, once the motion since the standstill tells the scale.
 
         Args:
-            frame: features of the current frame, without those that are known to move.
+            frame: features of the current frame.
+            dynamic: ids (N,) of features that are known to move, ascending.
             state: the estimate then, with its covariance.
             still: whether the platform stands still.
         """
@@ -74,18 +79,23 @@ class TakeOff:
         self._frames.append(frame)
         self.done = self.length_ns > round(_LONGEST_S * 1e9)
         early = self.length_ns < round(_SHORTEST_S * 1e9)
-        if self.done or early or state.stamp_ns - self._tried_ns < round(RETRY_S * 1e9):
+        early |= state.stamp_ns - self._tried_ns < round(RETRY_S * 1e9)
+        static = frame.without(dynamic)
+        if self.done or early or len(static.cameras[0]) < MIN_FEATURES:
             return None
         self._tried_ns = state.stamp_ns
-        window = self._solution()
+        window = self._solution(dynamic)
         self.done = window is not None
         return window
 
-    def _solution(self) -> Window | None:
+    def _solution(self, dynamic: IntArray) -> Window | None:
+        """The window that begins with the last frame; None if the scale is not known yet."""
         stamps_ns = [state.stamp_ns for state in self._states]
-        frames = StartFrames.thinned(stamps_ns, self._frames, _SPACING_S)
+        static = [frame.without(dynamic) for frame in self._frames]
+        spacing_s = max(_SPACING_S, self.length_ns * 1e-9 / _MOST_FRAMES)
+        frames = StartFrames.thinned(stamps_ns, static, spacing_s)
         if frames.stamps_ns[0] != stamps_ns[0]:
-            with_first = [stamps_ns[0], *frames.stamps_ns], [self._frames[0], *frames.frames]
+            with_first = [stamps_ns[0], *frames.stamps_ns], [static[0], *frames.frames]
             frames = StartFrames(*with_first)
         chosen = set(frames.stamps_ns)
         states = [state for state in self._states if state.stamp_ns in chosen]
