@@ -149,7 +149,8 @@ def moved_shares(monkeypatch: pytest.MonkeyPatch, largest: float) -> FloatArray:
         measured, state = constructed.cost.landmarks, window.state
         if measured is not None:
             points = state.positions_of(measured.ids)
-            away = points - state.frames.atPose3(X(window.frame)).translation()
+            body = state.frames.atPose3(X(window.frame))
+            away = points - body.compose(rig().cameras[0].body_T_camera).translation()
             moved = points - state.positions_of(measured.ids, first=True)
             shares.append(np.linalg.norm(moved, axis=1) / np.linalg.norm(away, axis=1))
         return constructed

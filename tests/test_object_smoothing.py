@@ -103,6 +103,7 @@ def test_smoothed_objects_are_better_than_those_on_the_way(two: RunResult) -> No
         for this, name in ((smoothed, "smoothed"), (causal, "accuracy"))
     ]
     assert errors_m[0] < 0.5 * errors_m[1]
+    assert smoothed["pose_translation_m"] < 0.65 * causal["pose_translation_m"]
     assert smoothed["pose_translation_m"] < 0.015
     assert causal["pose_translation_m"] < 0.03
 

@@ -29,14 +29,11 @@ import sys
 from pathlib import Path
 import cv2
 import slam_graph as sg
-from slam_graph.visualization.style import Picture
 cv2.setNumThreads(int(sys.argv[3]))
 for algorithm in sys.argv[5:]:
     result = sg.run(sys.argv[1], algorithm=algorithm, overrides=["overlap=" + sys.argv[4]])
     result.save(Path(sys.argv[2]) / algorithm)
-    Picture.png = lambda picture: b""
 """
-"""All algorithms are run; the first is drawn as well, all others are drawn in the same way."""
 
 
 def run_all(recording: Path, output: Path, threads: int, overlap: bool) -> None:
@@ -55,7 +52,7 @@ def run_all(recording: Path, output: Path, threads: int, overlap: bool) -> None:
 @pytest.fixture(scope="module")
 def both(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     root = tmp_path_factory.mktemp("repeats")
-    simulate(kind="images", duration_s=2.4, rate_hz=10.0).save(root / "flight")
+    simulate(kind="images", duration_s=3.0, rate_hz=10.0).save(root / "flight")
     first, second = root / "first", root / "second"
     run_all(root / "flight", first, 1, False)
     run_all(root / "flight", second, 2, True)

@@ -48,7 +48,7 @@ from slam_graph.errors import EstimationError
 MAX_MOVED = 0.5
 """Features of the state that have moved from their linearisation point by more than this share of
 their distance from the nearest camera are not measured again. Jacobians go as one over the
-distance: up to there they are at most twice as large as they should be."""
+distance: within it they are at most twice as large as they should be."""
 _MAX_FAILURES = 3
 """Features that are outliers in this many consecutive frames are treated as dynamic."""
 
@@ -202,7 +202,7 @@ class CostConstruction:
         return cost
 
     def _measured_again(self, window: Window) -> IntArray:
-        """The features of the state, ascending, that the current frame sees and that are measured.
+        """The features of the state, ascending, that are measured in the current frame.
 
         Where an estimate is far from its linearisation point, the Jacobian there is wrong and would
         turn the platform. Such features leave the state, and their tracks start anew. Lost features
@@ -215,8 +215,8 @@ class CostConstruction:
         state = window.state
         points, first = state.positions_of(ids), state.positions_of(ids, first=True)
         (R,), (p,) = state.poses([window.frame])
-        eyes = p + self.rig.body_p_camera @ R.T
-        away = np.add.reduce((points[:, None] - eyes) ** 2, axis=2).min(axis=1)
+        centres = p + self.rig.body_p_camera @ R.T
+        away = np.add.reduce((points[:, None] - centres) ** 2, axis=2).min(axis=1)
         moved = np.add.reduce((points - first) ** 2, axis=1)
         near: IntArray = ids[moved <= MAX_MOVED**2 * away]
         return near

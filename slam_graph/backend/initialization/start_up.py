@@ -30,7 +30,7 @@ class StartUp:
     Attributes:
         outliers: ids (N,) of the features that did not fit the last start, ascending.
         joint: how the start continues a segment before; None in the first.
-        doubtful: whether the start is still looked at again.
+        doubtful: whether the start may still be corrected, or has just been.
         contradicted: whether the last new window contradicts the states before.
     """
 
@@ -54,7 +54,7 @@ class StartUp:
         self._visual = MonocularStart(context) if alone else VisualStart(context)
         self._review: StartReview | None = None
         self._take_off: TakeOff | None = None
-        self._new_ns = -COMPARED_NS
+        self._corrected_ns: int | None = None
 
     def try_to_start(self, stamp_ns: int, frame: FeatureFrame) -> Window | None:
         """The first window, if this frame makes a start possible.
@@ -98,9 +98,11 @@ class StartUp:
             window = self._reviewed(self._review, frame, state)
         if window is not None and not self.contradicted:
             # what compares frames with the states before must not do so across the new window
-            self._new_ns = state.stamp_ns
+            self._corrected_ns = state.stamp_ns
         waiting = self._take_off is not None or self._review is not None
-        self.doubtful = waiting or state.stamp_ns - self._new_ns <= COMPARED_NS
+        corrected_ns = self._corrected_ns
+        recent = corrected_ns is not None and state.stamp_ns - corrected_ns <= COMPARED_NS
+        self.doubtful = waiting or recent
         return window
 
     def _first_motion(
@@ -118,7 +120,7 @@ class StartUp:
             self.outliers = ascending_union(dynamic, take_off.outliers)
             self.contradicted = contradict(state, window.current(window.prior), by_much=False)
             if self.contradicted:
-                warn_of_correction(self._context.diagnostics, take_off.length_ns)
+                warn_of_correction(self._context.diagnostics, take_off.elapsed_ns)
         if take_off.done:
             self._take_off = None
         return window

@@ -50,7 +50,7 @@ class TakeOff:
         self._refinement = DynamicRefinement(context, _MAX_SCALE_SIGMA)
         self._states: list[NavState] = []
         self._frames: list[FeatureFrame] = []
-        self._tried_ns = 0
+        self._next_ns = 0
 
     @property
     def outliers(self) -> IntArray:
@@ -58,7 +58,7 @@ class TakeOff:
         return self._refinement.outliers
 
     @property
-    def length_ns(self) -> int:
+    def elapsed_ns(self) -> int:
         """Time since the standstill."""
         return self._states[-1].stamp_ns - self._states[0].stamp_ns
 
@@ -73,17 +73,16 @@ class TakeOff:
             state: the estimate then, with its covariance.
             still: whether the platform stands still.
         """
-        if still:
+        if still or not self._states:
             self._states, self._frames = [], []
+            self._next_ns = state.stamp_ns + round(_SHORTEST_S * 1e9)
         self._states.append(state)
         self._frames.append(frame)
-        self.done = self.length_ns > round(_LONGEST_S * 1e9)
-        early = self.length_ns < round(_SHORTEST_S * 1e9)
-        early |= state.stamp_ns - self._tried_ns < round(RETRY_S * 1e9)
-        static = frame.without(dynamic)
-        if self.done or early or len(static.cameras[0]) < MIN_FEATURES:
+        self.done = self.elapsed_ns > round(_LONGEST_S * 1e9)
+        few = len(frame.without(dynamic).cameras[0]) < MIN_FEATURES
+        if self.done or few or state.stamp_ns < self._next_ns:
             return None
-        self._tried_ns = state.stamp_ns
+        self._next_ns = state.stamp_ns + round(RETRY_S * 1e9)
         window = self._solution(dynamic)
         self.done = window is not None
         return window
@@ -92,7 +91,7 @@ class TakeOff:
         """The window that begins with the last frame; None if the scale is not known yet."""
         stamps_ns = [state.stamp_ns for state in self._states]
         static = [frame.without(dynamic) for frame in self._frames]
-        spacing_s = max(_SPACING_S, self.length_ns * 1e-9 / _MOST_FRAMES)
+        spacing_s = max(_SPACING_S, self.elapsed_ns * 1e-9 / _MOST_FRAMES)
         frames = StartFrames.thinned(stamps_ns, static, spacing_s)
         if frames.stamps_ns[0] != stamps_ns[0]:
             with_first = [stamps_ns[0], *frames.stamps_ns], [static[0], *frames.frames]
