@@ -32,7 +32,12 @@ def _start(cache: Path, environment: dict[str, str]) -> tuple[subprocess.Popen[b
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         stderr=subprocess.DEVNULL,
-        env={**inherited, "NUMBA_CACHE_DIR": str(cache), **environment},
+        env={
+            **inherited,
+            "NUMBA_CACHE_DIR": str(cache),
+            "SLAM_GRAPH_KERNELS": "numba",
+            **environment,
+        },
         start_new_session=True,
     )
     assert process.stdout is not None

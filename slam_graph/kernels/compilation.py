@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""How kernels are compiled: once on a machine, and loaded from Numba's cache afterwards."""
+"""How kernels are compiled: once on a machine, for libraries or into Numba's cache."""
 
 from __future__ import annotations
 
@@ -10,50 +10,80 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any, TypeVar, cast
 
-import numba
-
 from slam_graph.interrupts import Interrupts
-from slam_graph.kernels.second_compiler import start_second_compiler
+from slam_graph.kernels.linked import are_linked, linked_kernel
 
-__all__ = ["compiled"]
+__all__ = ["collected", "compiled"]
 
 logger = logging.getLogger("slam_graph")
 
 _Kernel = TypeVar("_Kernel", bound=Callable[..., object])
 
+collected: list[tuple[Any, str]] | None = None
+"""Kernels and their signatures, where a process makes libraries of them; None elsewhere."""
+_SEMANTICS: dict[str, Any] = {"nogil": True, "error_model": "numpy"}
+"""Without Python's lock, where kernels are compiled in the process; a division by zero is infinite
+or NaN, as in NumPy."""
 _told = False
 
 
-def compiled(*signatures: str) -> Callable[[_Kernel], _Kernel]:
-    """Compile a function to machine code, without Python's lock while it runs.
+def compiled(signature: str = "") -> Callable[[_Kernel], _Kernel]:
+    """Compile a function to machine code.
 
-    In double precision with the roundings of IEEE 754 in the order that is written; a division by
-    zero is infinite or NaN, as in NumPy. Functions that it calls must be in its own file: Numba's
-    cache looks at nothing else to see what has changed.
+    In double precision with the roundings of IEEE 754 in the order that is written. Functions that
+    it calls must be in its own file: Numba's cache looks at nothing else to see what has changed.
 
     Args:
-        signatures: types of arguments and result in Numba's notation, e.g. `f8[::1](f8[:, ::1])`;
+        signature: types of arguments and result in Numba's notation, e.g. `f8[::1](f8[:, ::1])`;
             none for functions that are called by kernels only, which take what they are given.
     """
 
     def decorate(function: _Kernel) -> _Kernel:
-        # a kernel is stored with the functions that it calls; entries that nobody uses would only
-        # take time to compile
-        options: dict[str, Any] = {
-            "cache": bool(signatures),
-            "no_cpython_wrapper": not signatures,
-            "no_cfunc_wrapper": True,
-        }
-        jit = numba.njit(list(signatures) or None, nogil=True, error_model="numpy", **options)
-        # a callback of the compiler would lose Ctrl-C
-        with Interrupts.completed() as begin, _without_collection():
-            begin()
-            kernel = cast("_Kernel", jit(function))
-        if signatures:
-            _tell(kernel)
-        return kernel
+        if collected is not None:
+            kernel = _collect(function, signature, collected)
+        elif not are_linked():
+            kernel = _compile(function, signature)
+        elif signature:
+            kernel = linked_kernel(function, signature)
+        else:
+            return function  # part of the kernels that call it
+        return cast("_Kernel", kernel)
 
     return decorate
+
+
+def _collect(
+    function: Callable[..., object], signature: str, kernels: list[tuple[Any, str]]
+) -> Callable[..., object]:
+    """Leave it to the maker of a library when a function is compiled."""
+    import numba
+
+    options: dict[str, Any] = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
+    kernel = numba.njit(**options, **_SEMANTICS)(function)
+    if signature:
+        kernels.append((kernel, signature))
+    return cast("Callable[..., object]", kernel)
+
+
+def _compile(function: Callable[..., object], signature: str) -> Callable[..., object]:
+    """Compile a function now, or load it from Numba's cache."""
+    import numba  # takes half a second and 110 MB: not where kernels are linked
+
+    # a kernel is stored with the functions that it calls; entries that nobody uses would only
+    # take time to compile
+    options: dict[str, Any] = {
+        "cache": bool(signature),
+        "no_cpython_wrapper": not signature,
+        "no_cfunc_wrapper": True,
+    }
+    jit: Any = numba.njit([signature] if signature else None, **options, **_SEMANTICS)
+    # a callback of the compiler would lose Ctrl-C
+    with Interrupts.completed() as begin, _without_collection():
+        begin()
+        kernel = jit(function)
+    if signature:
+        _tell(kernel)
+    return cast("Callable[..., object]", kernel)
 
 
 @contextmanager
@@ -78,4 +108,6 @@ def _tell(kernel: object) -> None:
     if not _told and stats is not None and stats.cache_misses:
         _told = True
         logger.warning("compiling kernels: once on this machine, some 15 s")
+        from slam_graph.kernels.second_compiler import start_second_compiler
+
         start_second_compiler()

@@ -9,10 +9,8 @@ from __future__ import annotations
 
 import os
 import subprocess
-import sys
 from contextlib import suppress
 from importlib import import_module
-from pathlib import Path
 from pkgutil import iter_modules
 from threading import Thread
 from typing import Any
@@ -20,6 +18,7 @@ from typing import Any
 import numba
 
 import slam_graph.kernels
+from slam_graph.kernels.python_process import command_of, inherited_imports
 
 __all__ = ["start_second_compiler"]
 
@@ -34,25 +33,23 @@ def start_second_compiler() -> None:
     middle on; one that both compile at the same time is stored twice, with the same content. Nobody
     waits for the process, and where it cannot be started kernels are compiled as without it.
     """
-    # within an application it would start that application again
-    is_python = Path(sys.executable or "").name.startswith("python")
+    command = command_of(__spec__.name)
     settings: Any = numba.config  # its names are made when it is imported
     several = settings.NUMBA_DEFAULT_NUM_THREADS > 1  # cores that this process may use
-    if is_python and not hasattr(sys, "frozen") and several and _ITSELF not in os.environ:
+    if command is not None and several and _ITSELF not in os.environ:
         os.environ[_ITSELF] = "1"  # the processes of this one need none of their own
-        Thread(target=_run, name="second compiler", daemon=True).start()
+        Thread(target=_run, args=(command,), name="second compiler", daemon=True).start()
 
 
-def _run() -> None:
-    """Run it to its end; what it imports is what this process imports."""
-    paths = os.pathsep.join(str(path) or os.getcwd() for path in sys.path)
+def _run(command: list[str]) -> None:
+    """Run it to its end."""
     with suppress(OSError):
         subprocess.run(
-            [sys.executable, "-P", "-m", __spec__.name],
+            command,
             stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
-            env={**os.environ, "PYTHONPATH": paths},
+            env=inherited_imports(),
             check=False,
         )
 

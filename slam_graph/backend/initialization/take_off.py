@@ -25,8 +25,8 @@ _SHORTEST_S, _LONGEST_S = 1.0, 5.0
 """How long after the standstill the motion is solved at the earliest, and at the latest."""
 _MAX_SCALE_SIGMA = 0.03
 """Largest standard deviation of the scale with which the estimator goes on, relative to it."""
-_SPACING_S, _MOST_FRAMES = 0.1, 20
-"""Time between the frames of the batch problem; longer where there would be more of them."""
+_MOST_FRAMES = 40
+"""Frames of the batch problem; where there are more, not all are used."""
 _MIN_FRAMES = 3
 """Features that fewer of them see are not used."""
 
@@ -91,7 +91,7 @@ class TakeOff:
         """The window that begins with the last frame; None if the scale is not known yet."""
         stamps_ns = [state.stamp_ns for state in self._states]
         static = [frame.without(dynamic) for frame in self._frames]
-        spacing_s = max(_SPACING_S, self.elapsed_ns * 1e-9 / _MOST_FRAMES)
+        spacing_s = self.elapsed_ns * 1e-9 / _MOST_FRAMES
         frames = StartFrames.thinned(stamps_ns, static, spacing_s)
         if frames.stamps_ns[0] != stamps_ns[0]:
             with_first = [stamps_ns[0], *frames.stamps_ns], [static[0], *frames.frames]

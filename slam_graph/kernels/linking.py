@@ -1,0 +1,68 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""Makes one of the shared libraries of kernels, in a process of its own.
+
+python -m slam_graph.kernels.linking PART FILE
+"""
+
+from __future__ import annotations
+
+import gc
+import os
+import sys
+from importlib import import_module
+from inspect import signature
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numba.pycc
+
+from slam_graph.kernels import compilation
+from slam_graph.kernels.library_files import PARTS, module_name, processor
+
+__all__: list[str] = []
+
+
+def main(part: int, path: Path) -> None:
+    """Compile the kernels of a part, and link them.
+
+    Args:
+        part: which part of the kernels.
+        path: the file to make.
+    """
+    gc.disable()  # searching the compiler's objects for cycles takes a tenth of the time
+    compilation.collected = []
+    for name in _modules(part):
+        import_module(f"slam_graph.kernels.{name}")
+    # what Numba has in C converts arguments: not worth being optimised for seconds
+    os.environ["CFLAGS"] = os.environ["CXXFLAGS"] = "-O1 -g0"
+    compiler: Any = numba.pycc  # it has no types
+    library = compiler.CC(module_name(part), source_module="slam_graph.kernels")
+    library.target_cpu = processor() if processor() != "generic" else ""
+    for kernel, types in compilation.collected:
+        library.export(kernel.__name__, types)(_caller(kernel))
+    with TemporaryDirectory(dir=path.parent, prefix="kernels-") as folder:
+        library.output_dir, library.output_file = folder, path.name
+        library.compile()
+        os.replace(Path(folder) / path.name, path)
+
+
+def _modules(part: int) -> list[str]:
+    """Names of the modules of a part: all parts have about as much source."""
+    sizes = {p.stem: p.stat().st_size for p in Path(__file__).parent.glob("*.py")}
+    parts: list[list[str]] = [[] for _ in range(PARTS)]
+    for name in sorted(sizes, key=sizes.__getitem__):
+        least = min(parts, key=lambda names: sum(sizes[other] for other in names))
+        least.append(name)
+    return parts[part]
+
+
+def _caller(kernel: Any) -> Any:
+    """A function that only calls a kernel: Numba exports functions under its own error model."""
+    arguments = ", ".join(signature(kernel.py_func).parameters)
+    return eval(f"lambda {arguments}: kernel({arguments})", {"kernel": kernel})
+
+
+if __name__ == "__main__":
+    main(int(sys.argv[1]), Path(sys.argv[2]))

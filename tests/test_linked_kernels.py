@@ -1,0 +1,154 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""Kernels in shared libraries: who makes them, that they are used, and what they refuse."""
+
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from slam_graph.kernels import library_files, linked
+from slam_graph.kernels.ascending import are_among
+from slam_graph.kernels.gate import observation_distances
+from slam_graph.kernels.spacing import apart
+
+pytestmark = pytest.mark.skipif(not linked.are_linked(), reason="needs a C compiler")
+
+_RESULTS = """
+import sys
+import numpy as np
+from slam_graph.kernels.epipolar import ray_depths
+from slam_graph.kernels.gate import observation_distances
+rng = np.random.default_rng(0)
+root = np.asfortranarray(rng.normal(size=(9, 9)))
+distances = np.empty(50)
+observation_distances(
+    rng.normal(size=(50, 2)), rng.normal(size=(50, 2, 4)), root,
+    rng.integers(0, 9, (50, 4)), distances,
+)
+depths = ray_depths(np.eye(3), np.ones(3), rng.normal(size=(50, 2)), rng.normal(size=(50, 2)))
+print("numba" in sys.modules, distances.tobytes().hex(), depths.tobytes().hex())
+"""
+
+_ONE_MODULE = """
+import sys
+from pathlib import Path
+from slam_graph.kernels import linking
+linking._modules = lambda part: ["ascending"]
+linking.main(0, Path(sys.argv[1]))
+"""
+
+
+def _output(code: str, *arguments: str, **environment: str) -> list[str]:
+    """What a process of its own prints."""
+    return subprocess.run(
+        [sys.executable, "-W", "ignore", "-c", code, *arguments],
+        check=True,
+        stdout=subprocess.PIPE,
+        text=True,
+        env={**os.environ, **environment},
+    ).stdout.split()
+
+
+def test_libraries_do_without_numba_and_give_the_same_bits() -> None:
+    linked_modules, *linked_results = _output(_RESULTS)
+    compiled_modules, *compiled_results = _output(_RESULTS, SLAM_GRAPH_KERNELS="numba")
+    assert (linked_modules, compiled_modules) == ("False", "True")
+    assert linked_results == compiled_results
+
+
+def _observations() -> list[Any]:
+    return [
+        np.zeros((2, 2)),
+        np.zeros((2, 2, 3)),
+        np.zeros((4, 3), order="F"),
+        np.zeros((2, 3), np.int64),
+        np.zeros(2),
+    ]
+
+
+def _read_only(array: Any) -> Any:
+    array.flags.writeable = False
+    return array
+
+
+@pytest.mark.parametrize(
+    ("argument", "wrong"),
+    [
+        (0, np.zeros((2, 2), np.float32)),
+        (0, np.zeros((2, 2), np.int64)),
+        (0, np.zeros(4)),
+        (0, np.zeros((2, 4))[:, ::2]),
+        (0, np.zeros((2, 2), ">f8")),
+        (0, [[0.0, 0.0], [0.0, 0.0]]),
+        (0, None),
+        (2, np.zeros((4, 3))),
+        (3, np.zeros((2, 3))),
+        (4, _read_only(np.zeros(2))),
+    ],
+)
+def test_arrays_that_do_not_fit_are_refused(argument: int, wrong: object) -> None:
+    given = _observations()
+    observation_distances(*given)
+    given[argument] = wrong
+    with pytest.raises(TypeError, match=f"argument {argument} of observation_distances"):
+        observation_distances(*given)
+
+
+def test_other_wrong_arguments_are_refused() -> None:
+    kernel: Callable[..., object] = are_among
+    with pytest.raises(TypeError, match="takes 2 arguments, not 1"):
+        kernel(np.arange(3))
+    points: Any = np.zeros((2, 2), np.float32)
+    count: Any = None
+    with pytest.raises(TypeError, match="argument 1 of apart is no number"):
+        apart(points, count)
+
+
+def test_a_library_can_be_made_anywhere(tmp_path: Path) -> None:
+    path = tmp_path / f"made{library_files._SUFFIX}"
+    _output(_ONE_MODULE, str(path))
+    assert list(tmp_path.iterdir()) == [path]
+    library = linked._loaded(path, library_files.module_name(0))
+    assert library.are_among(np.arange(4), np.array([1, 3])).tolist() == [False, True, False, True]
+
+
+def test_what_fails_is_not_tried_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    paths = [tmp_path / "kernels-0.so", tmp_path / "kernels-1.so"]
+    monkeypatch.setattr(library_files, "_LINKING", "slam_graph.kernels.no_such_module")
+    library_files.make(paths)
+    said = (tmp_path / "kernels-0.failed").read_text(encoding="utf-8")
+    assert said.count("no_such_module") == len(paths)
+    monkeypatch.setattr(library_files, "_run", lambda commands: pytest.fail("tried again"))
+    library_files.make(paths)
+
+
+def test_libraries_of_long_ago_are_removed(tmp_path: Path) -> None:
+    old, new = tmp_path / "kernels-old-0.so", tmp_path / "kernels-new-0.so"
+    for path in (old, new):
+        path.touch()
+    os.utime(old, (0, 0))
+    library_files._remove_stale(tmp_path)
+    assert list(tmp_path.iterdir()) == [new]
+
+
+def test_another_source_is_another_library(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    before = library_files.library_paths()
+    copied = tmp_path / "kernels"
+    copied.mkdir()
+    for path in Path(library_files.__file__).parent.glob("*.py"):
+        (copied / path.name).write_bytes(path.read_bytes())
+    (copied / "gate.py").write_text("# another", encoding="utf-8")
+    monkeypatch.setattr(library_files, "__file__", str(copied / "library_files.py"))
+    library_files._digest.cache_clear()
+    try:
+        after = library_files.library_paths()
+    finally:
+        library_files._digest.cache_clear()
+    assert {path.name for path in before}.isdisjoint(path.name for path in after)
+    assert after[0].parent == copied / "__pycache__"
