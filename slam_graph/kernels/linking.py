@@ -10,13 +10,12 @@ from __future__ import annotations
 import gc
 import os
 import sys
+import warnings
 from importlib import import_module
 from inspect import signature
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
-
-import numba.pycc
 
 from slam_graph.kernels import compilation
 from slam_graph.kernels.library_files import PARTS, module_name, processor
@@ -37,8 +36,10 @@ def main(part: int, path: Path) -> None:
         import_module(f"slam_graph.kernels.{name}")
     # what Numba has in C converts arguments: not worth being optimised for seconds
     os.environ["CFLAGS"] = os.environ["CXXFLAGS"] = "-O1 -g0"
-    compiler: Any = numba.pycc  # it has no types
-    library = compiler.CC(module_name(part), source_module="slam_graph.kernels")
+    with warnings.catch_warnings():  # of a successor that is still to come
+        warnings.simplefilter("ignore")
+        pycc: Any = import_module("numba.pycc")
+    library = pycc.CC(module_name(part), source_module="slam_graph.kernels")
     library.target_cpu = processor() if processor() != "generic" else ""
     for kernel, types in compilation.collected:
         library.export(kernel.__name__, types)(_caller(kernel))

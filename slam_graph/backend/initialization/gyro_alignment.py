@@ -41,6 +41,8 @@ _REWEIGHTINGS = 3
 """How often wrong rotations lose weight."""
 _MEDIAN_CHI2_3 = 2.366
 """Median of χ² with three degrees of freedom."""
+_MOVING_CHI2 = 25.0
+"""Squared size, in units of its information, of a rotation that is none of noise."""
 _CORRELATION = 2.0
 """Rotations that share frames have errors in common: standard deviations are larger than those of
 independent ones by this factor (measured on simulated flights with real and simulated IMUs)."""
@@ -124,13 +126,22 @@ class _Gyroscope:
 
 
 class _Problem:
-    """The least cost over bias and mounting at each of many offsets."""
+    """The least cost over bias and mounting at each of many offsets.
+
+    Attributes:
+        moving: (K,) the rotations that are not of a camera at rest, or all if there are none.
+            Those have smaller errors, and show nothing of the offset.
+    """
 
     def __init__(self, turns: Turns, imu: ImuData) -> None:
         self._gyro = _Gyroscope(imu)
         self._t = 1e-9 * (np.stack([turns.first_ns, turns.second_ns]) - self._gyro.start_ns)
         self._seconds = self._t[1] - self._t[0]
         self._turns = turns
+        vectors = Rotation.from_matrix(turns.R).as_rotvec()
+        squares = np.einsum("ki,kij,kj->k", vectors, turns.information, vectors)
+        moving = squares > _MOVING_CHI2
+        self.moving = moving if moving.any() else ~moving
 
     def body_turns(self, offsets: FloatArray) -> FloatArray:
         """Rotation vectors (D, K, 3) of the body between the frames, for D offsets."""
@@ -180,7 +191,7 @@ class _Problem:
 
 
 def _robust_least_squares(
-    r: FloatArray, J: FloatArray, scale: float | None
+    r: FloatArray, J: FloatArray, scale: float | None, moving: BoolArray
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Least robust cost of D problems r + J x with K residuals of three rows each.
 
@@ -188,6 +199,7 @@ def _robust_least_squares(
         r: (D, K, 3).
         J: (D, K, 3, n), by the gyroscope bias and the mounting or the offset, if one is estimated.
         scale: variance of the residuals in units of their information; None to measure it.
+        moving: (K,) by which residuals it is measured.
 
     Returns:
         Cost (D,), unknowns (D, n), their information (D, n, n), and the scale (D,).
@@ -202,7 +214,7 @@ def _robust_least_squares(
         H = weighted @ J + prior
         x = -np.linalg.solve(H, weighted @ r[..., None])[..., 0]
         squares = np.sum((r + (J @ x[..., None])[..., 0]).reshape(D, K, 3) ** 2, axis=2)
-        measured = np.maximum(median(squares.T) / _MEDIAN_CHI2_3, 1e-9)
+        measured = np.maximum(median(squares[:, moving].T) / _MEDIAN_CHI2_3, 1e-9)
         width = _CAUCHY_WIDTH**2 * (measured if scale is None else np.full(D, scale))
         weights = 1.0 / (1.0 + squares / (3.0 * width[:, None]))
     cost = 0.5 * np.sum(np.log1p(squares / (3.0 * width[:, None])), axis=1) * 3.0 * width
@@ -232,8 +244,8 @@ def align_gyroscope(
         C = mountings[np.argmin(residuals)]
     for _ in range(_REWEIGHTINGS if free else 1):
         r, J = problem.linearized(body, C, free)
-        scale = float(np.min(_robust_least_squares(r, J, None)[3]))
-        cost, x, H, _ = _robust_least_squares(r, J, scale)
+        scale = float(np.min(_robust_least_squares(r, J, None, problem.moving)[3]))
+        cost, x, H, _ = _robust_least_squares(r, J, scale, problem.moving)
         best = int(np.argmin(cost))
         if free:
             C = C @ Rotation.from_rotvec(x[best, 3:]).as_matrix()
@@ -243,7 +255,7 @@ def align_gyroscope(
     margin = float(np.min(cost[apart]) - cost[best]) / scale
     fine = grid[best] + _FINE_S * np.arange(-5, 6)
     r, J = problem.linearized(problem.body_turns(fine), C, free)
-    cost, x, H, _ = _robust_least_squares(r, J, scale)
+    cost, x, H, _ = _robust_least_squares(r, J, scale, problem.moving)
     curve = np.polyfit(fine - grid[best], cost, 2)
     if curve[0] <= 0.0:
         return None
@@ -281,7 +293,7 @@ def offset_step(
     r, J = problem.linearized(around, body_R_camera, free=False)
     by_offset = (r[2] - r[1]) / (2.0 * _COARSE_S)
     J = np.concatenate([J[0], by_offset[..., None]], axis=-1)[None]
-    _, x, H, scale = _robust_least_squares(r[:1], J, None)
+    _, x, H, scale = _robust_least_squares(r[:1], J, None, problem.moving)
     variance = float(np.linalg.inv(H[0])[3, 3] * scale[0])
     return float(x[0, 3]), _CORRELATION * float(np.sqrt(variance))
 
@@ -309,7 +321,7 @@ def log_likelihood_ratios(
     body = problem.body_turns(np.array(offsets_s))
     r, J = problem.linearized(body, body_R_camera, free=False)
     squares = np.sum((r + J @ gyro_bias) ** 2, axis=2)
-    noise = max(float(np.median(squares.min(axis=0))) / _MEDIAN_CHI2_3, 1e-9)
+    noise = max(float(np.median(squares.min(axis=0)[problem.moving])) / _MEDIAN_CHI2_3, 1e-9)
     costs = 0.5 * _CAUCHY_WIDTH**2 * np.log1p(squares / (_CAUCHY_WIDTH**2 * noise))
     return np.asarray(costs[0] - costs[1])
 
