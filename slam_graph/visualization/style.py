@@ -19,6 +19,7 @@ import numpy as np
 from matplotlib import rc_context
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.text import Text
 from PIL import Image  # a requirement of matplotlib
 
 BLUE, VERMILION, GREEN, PURPLE = "#0072B2", "#D55E00", "#009E73", "#CC79A7"
@@ -59,6 +60,8 @@ _VARIANT = "_no_fej"
 """What ends with this has the colour of the name before it, and is dashed."""
 
 _FILE_DPI, _NOTEBOOK_DPI = 150, 100
+_COMPRESSION = 3
+"""Of a file: as small as with 6 and an opacity, in half the time."""
 _COLOURS = 224
 """Of a light picture: as many as antialiased lines and letters need."""
 
@@ -125,10 +128,14 @@ def line_styles(names: Iterable[str]) -> dict[str, LineStyle]:
 class Picture(Figure):
     """A figure that needs no window, and shows itself in Jupyter without `%matplotlib`."""
 
+    title: Text | None = None
+    """What is above all that is drawn, if there is something."""
+
     def png(self, dpi: int = _FILE_DPI) -> bytes:
         """The picture as a PNG file."""
         buffer = io.BytesIO()
-        self._drawn(dpi).save(buffer, "PNG", dpi=(dpi, dpi))
+        whole = self._drawn(dpi).convert("RGB")  # nothing is transparent
+        whole.save(buffer, "PNG", dpi=(dpi, dpi), compress_level=_COMPRESSION)
         return buffer.getvalue()
 
     def _drawn(self, dpi: int) -> Image.Image:
@@ -172,5 +179,5 @@ def drawing(title: str, size_inches: tuple[float, float]) -> Iterator[Picture]:
         engine: Any = figure.get_layout_engine()
         engine.set(w_pad=0.07, h_pad=0.06)
         if title:
-            figure.suptitle(title, x=0.012, ha="left", linespacing=1.35)
+            figure.title = figure.suptitle(title, x=0.012, ha="left", linespacing=1.35)
         yield figure
