@@ -7,6 +7,7 @@ Nothing has been written then, or all of it. In between `slam_graph.cli.main` de
 
 from __future__ import annotations
 
+import gc
 import os
 import signal
 import sys
@@ -33,6 +34,7 @@ def main() -> None:
     code = run_command()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.SIG_IGN)  # all is written: what ends now is the interpreter
+    gc.freeze()  # the interpreter would look through all that was imported once more, for nothing
     if code == _INTERRUPTED:
         # Python kills itself with SIGINT at its end where `exec` of a text was interrupted, as in
         # the import of a data class, although the interrupt was handled; the code would be lost
