@@ -11,7 +11,6 @@ from typing import Any, Literal
 import numpy as np
 
 from slam_graph.arrays import FloatArray
-from slam_graph.visualization.panel_layout import Column, PanelLayout
 from slam_graph.visualization.style import GREY, LineStyle, Picture, drawing, line_styles
 
 _CELL_INCHES = (5.2, 2.9)
@@ -36,9 +35,6 @@ _WIDEST: dict[str, float] = {"path": 3.4, "errors": 1.8}
 _NARROWEST = 1.0
 """Widths in points between which the lines of a panel fall in their order, so that one which covers
 another leaves its edges to be seen."""
-
-_TITLE_PAD_INCHES = 0.06
-"""Above and below the title of a picture."""
 
 _BOUNDS_REACH = 3.0
 """Bounds are shown as far as this many times the largest value, or their own median."""
@@ -99,17 +95,20 @@ def panel_figure(
     height_inches = height_inches or _cell_height(panels) * max(map(len, columns))
     widths_inches = widths_inches or [_CELL_INCHES[0]] * len(columns)
     styles = line_styles(_labels(panels))
-    placed: list[Column] = []
+    drawn: list[Any] = []
     with drawing(title, (sum(widths_inches), height_inches + 0.5)) as figure:
-        for column, width in zip(columns, widths_inches, strict=True):
+        outer = figure.add_gridspec(1, len(columns), width_ratios=widths_inches)
+        for k, column in enumerate(columns):
             heights = [column.count(letter) for letter in dict.fromkeys(column)]
+            inner = outer[k].subgridspec(len(heights), 1, height_ratios=heights)
             shown = [panels[letters.index(letter)] for letter in dict.fromkeys(column)]
-            axes = [figure.add_axes((0.1, 0.1, 0.8, 0.8)) for _ in shown]
+            axes = [figure.add_subplot(inner[row]) for row in range(len(shown))]
             for place, panel in zip(axes, shown, strict=True):
                 _draw(place, panel, styles)
             _share_x(axes, shown)
-            placed.append(Column(axes, heights, width))
-        figure.set_layout_engine(PanelLayout(placed, _title_inches(figure), _legend(figure)))
+            figure.align_ylabels(axes)
+            drawn += axes
+        _legend(figure, drawn)
     return figure
 
 
@@ -298,38 +297,23 @@ def _share_x(axes: Sequence[Any], panels: Sequence[Panel]) -> None:
             axes[k].set_xlabel("")
 
 
-def _title_inches(figure: Picture) -> float:
-    """Put the title at the top; returns the inches that it takes."""
-    if figure.title is None:
-        return 0.0
-    figure.title.set_y(1.0 - _TITLE_PAD_INCHES / figure.get_figheight())
-    return float(figure.title.get_window_extent().height) / figure.dpi + 1.5 * _TITLE_PAD_INCHES
-
-
-def _legend(figure: Picture) -> float:
-    """One legend for all panels, below them; returns the inches that it takes.
-
-    It has as many columns as there is room for.
-    """
+def _legend(figure: Picture, cells: Iterable[Any]) -> None:
+    """One legend for all panels, below them, with as many columns as there is room for."""
     entries: dict[str, Any] = {}
-    for axes in figure.axes:
+    for axes in cells:
         for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
             entries.setdefault(label, handle)
     if len(set(entries) - {"start"}) <= 1:
-        return 0.0
-    ncols = min(len(entries), 8)
-    while True:
+        return
+    for ncols in range(min(len(entries), 8), 0, -1):
         legend = figure.legend(
             entries.values(),
             entries.keys(),
-            loc="lower center",
+            loc="outside lower center",
             ncols=ncols,
             columnspacing=1.6,
             handlelength=1.8,
-            borderaxespad=0.5,
         )
-        extent = legend.get_window_extent()
-        if ncols == 1 or extent.width <= figure.bbox.width:
-            return float(extent.height) / figure.dpi + _TITLE_PAD_INCHES
+        if ncols == 1 or legend.get_window_extent().width <= figure.bbox.width:
+            return
         legend.remove()
-        ncols -= 1

@@ -19,7 +19,6 @@ import numpy as np
 from matplotlib import rc_context
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from matplotlib.text import Text
 from PIL import Image  # a requirement of matplotlib
 
 BLUE, VERMILION, GREEN, PURPLE = "#0072B2", "#D55E00", "#009E73", "#CC79A7"
@@ -128,9 +127,6 @@ def line_styles(names: Iterable[str]) -> dict[str, LineStyle]:
 class Picture(Figure):
     """A figure that needs no window, and shows itself in Jupyter without `%matplotlib`."""
 
-    title: Text | None = None
-    """What is above all that is drawn, if there is something."""
-
     def png(self, dpi: int = _FILE_DPI) -> bytes:
         """The picture as a PNG file."""
         buffer = io.BytesIO()
@@ -179,5 +175,5 @@ def drawing(title: str, size_inches: tuple[float, float]) -> Iterator[Picture]:
         engine: Any = figure.get_layout_engine()
         engine.set(w_pad=0.07, h_pad=0.06)
         if title:
-            figure.title = figure.suptitle(title, x=0.012, ha="left", linespacing=1.35)
+            figure.suptitle(title, x=0.012, ha="left", linespacing=1.35)
         yield figure
