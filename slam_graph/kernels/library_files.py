@@ -11,6 +11,7 @@ import platform
 import shlex
 import shutil
 import subprocess
+import sys
 import sysconfig
 import time
 from collections.abc import Iterator
@@ -108,7 +109,12 @@ def _run(commands: list[list[str]]) -> str:
 
 
 def _compiler_is_there() -> bool:
-    """Whether there is the C compiler that this Python was built with, and Python's headers."""
+    """Whether there is the C compiler that this Python was built with, and Python's headers.
+
+    On macOS the name of a compiler that is not installed opens a window, so it is not asked for.
+    """
+    if not sys.platform.startswith("linux"):
+        return False
     compiler = shlex.split(os.environ.get("CC") or sysconfig.get_config_var("CC") or "")
     headers = Path(sysconfig.get_path("include")) / "Python.h"
     return bool(compiler) and shutil.which(compiler[0]) is not None and headers.is_file()
@@ -144,7 +150,7 @@ def _is_writable(folder: Path) -> bool:
 @contextmanager
 def _alone_in(folder: Path) -> Iterator[None]:
     """Wait until no other process makes libraries in a folder, and let none in meanwhile."""
-    import fcntl  # not on Windows, where `_compiler_is_there` is false
+    import fcntl  # not on Windows, where libraries are not made
 
     with (folder / "kernels.lock").open("w") as file:
         fcntl.flock(file, fcntl.LOCK_EX)
