@@ -18,7 +18,12 @@ from typer.testing import CliRunner
 from slam_graph.arrays import FloatArray
 from slam_graph.backend.backend_config import BackendConfig, InitializationConfig
 from slam_graph.backend.estimator import Estimator
-from slam_graph.backend.initialization.gyro_alignment import Turns, align_gyroscope
+from slam_graph.backend.initialization.clock_monitor import ClockMonitor
+from slam_graph.backend.initialization.gyro_alignment import (
+    GyroAlignment,
+    Turns,
+    align_gyroscope,
+)
 from slam_graph.backend.initialization.start_calibration import FoundCalibration, StartCalibration
 from slam_graph.backend.initialization.visual_rotation import visual_rotation
 from slam_graph.cli.main import app
@@ -118,6 +123,35 @@ def test_sigma_of_the_offset_covers_its_error() -> None:
     found = align_gyroscope(turns(0.03, 3e-3), Flight().imu(0.5, 5.0), C, 0.0)
     assert found is not None
     assert abs(found.offset_s - 0.03) < 3 * found.offset_sigma_s < 0.01
+
+
+def test_rotations_at_rest_do_not_make_the_others_more_certain() -> None:
+    flight, C = Flight(), rig().cameras[0].body_T_camera.rotation().matrix()
+    moving, imu = turns(0.03, 3e-3), flight.imu(0.5, 5.0)
+    alone = align_gyroscope(moving, imu, C, 0.0)
+    before_ns, noise = imu.stamps_ns[-1] - imu.stamps_ns[0] + 10_000_000, np.full((120, 3), 1e-4)
+    still = ImuData(imu.stamps_ns - before_ns, 0.0 * imu.gyro + flight.gyro_bias, 0.0 * imu.accel)
+    first_ns = still.stamps_ns[0] + 300_000_000 + 20_000_000 * np.arange(len(noise))
+    with_rest = Turns(
+        np.concatenate([first_ns, moving.first_ns]),
+        np.concatenate([first_ns + 400_000_000, moving.second_ns]),
+        np.concatenate([Rotation.from_rotvec(noise).as_matrix(), moving.R]),
+        np.concatenate([np.repeat(moving.information[:1], len(noise), 0), moving.information]),
+    )
+    found = align_gyroscope(with_rest, ImuData.concatenate([still, imu]), C, 0.0)
+    assert alone is not None
+    assert found is not None
+    assert found.misfit == pytest.approx(alone.misfit, rel=0.2)
+    assert found.offset_sigma_s == pytest.approx(alone.offset_sigma_s, rel=0.2)
+
+
+def test_a_first_estimate_that_was_wrong_is_no_earlier_clock() -> None:
+    """One of 34.2 ± 4.1 ms, soon after a standstill, where the calibration is right."""
+    monitor, covered = ClockMonitor(rig().cameras[0]), (turns(0.0, 1e-3), Flight().imu(0.5, 5.0))
+    for offset_s, sigma_s in ((0.0342, 4.1e-3), (0.002, 2.5e-3), (-0.0006, 1.1e-3)):
+        found = GyroAlignment(offset_s, sigma_s, 100.0, np.zeros(3), np.eye(3), 0.0, 1.0)
+        assert monitor.compare(found, covered, ImuBuffer()) is None
+    assert monitor.knows
 
 
 def recorded(

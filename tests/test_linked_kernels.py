@@ -128,6 +128,32 @@ def test_what_fails_is_not_tried_again(tmp_path: Path, monkeypatch: pytest.Monke
     library_files.make(paths)
 
 
+def test_a_process_that_was_killed_has_not_failed() -> None:
+    kill_itself = "import os, signal; os.kill(os.getpid(), signal.SIGKILL)"
+    fail = "raise SystemExit('this one fails')"
+    run = [[sys.executable, "-c", code] for code in (kill_itself, fail)]
+    assert library_files._run(run[:1]) == ""
+    assert "this one fails" in library_files._run(run)
+
+
+def test_an_old_failure_is_tried_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    failed = tmp_path / "kernels-0.failed"
+    failed.touch()
+    os.utime(failed, (0, 0))
+    tried: list[int] = []
+    monkeypatch.setattr(library_files, "_run", lambda commands: tried.append(len(commands)))
+    library_files.make([tmp_path / "kernels-0.so"])
+    assert tried == [1]
+
+
+def test_without_a_compiler_nothing_is_tried(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("CC", "no-such-compiler -pthread")
+    library_files.make([tmp_path / "kernels-0.so"])
+    assert not list(tmp_path.iterdir())
+
+
 def test_libraries_of_long_ago_are_removed(tmp_path: Path) -> None:
     old, new = tmp_path / "kernels-old-0.so", tmp_path / "kernels-new-0.so"
     for path in (old, new):

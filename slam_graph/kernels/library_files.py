@@ -15,10 +15,12 @@ import sys
 import sysconfig
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from functools import cache
 from importlib.metadata import version
+from importlib.util import find_spec
 from pathlib import Path
+from tempfile import TemporaryFile
 
 from slam_graph.kernels.python_process import command_of, inherited_imports
 
@@ -30,10 +32,10 @@ PARTS = 2
 """Libraries that are made at the same time, each by a process of its own."""
 _LINKING = "slam_graph.kernels.linking"
 _SUFFIX: str = sysconfig.get_config_var("EXT_SUFFIX") or ".so"
-_FAILED = ".failed"
-"""Suffix of a file that says why libraries could not be made: not to be tried again each time."""
+_FAILED, _RETRY_S = ".failed", 24 * 3600.0
+"""Suffix of a file that says why libraries could not be made: it is not tried again for so long."""
 _STALE_S = 30 * 24 * 3600.0
-"""Libraries of other versions are removed when they were made so long ago."""
+"""Libraries that were not used for so long are removed when others are made."""
 _X86_64_V3 = frozenset(["avx", "avx2", "bmi1", "bmi2", "f16c", "fma", "abm", "movbe", "xsave"])
 """What x86-64-v3 has beyond the level below it, by Linux' names."""
 
@@ -66,58 +68,79 @@ def processor() -> str:
 def make(paths: list[Path]) -> None:
     """Make the libraries, or wait until another process has made them.
 
-    Nothing is raised: where they cannot be made they are not there afterwards.
+    Where they cannot be made they are not there afterwards.
 
     Args:
         paths: files to make, one for each part.
+
+    Raises:
+        OSError: if nothing can be stored in their folder.
     """
     commands = [command_of(_LINKING, str(part), str(path)) for part, path in enumerate(paths)]
-    if not _compiler_is_there():
+    given = [command for command in commands if command is not None]
+    if len(given) < len(paths) or not _tools_are_there():
         return
-    with suppress(OSError), _alone_in(paths[0].parent):
+    with _alone_in(paths[0].parent):
         failed = paths[0].with_suffix(_FAILED)
-        if failed.is_file() or all(path.is_file() for path in paths):
+        if _is_recent(failed, _RETRY_S) or all(path.is_file() for path in paths):
             return
         logger.warning("compiling kernels: once on this machine, some 15 s")
-        errors = _run([command for command in commands if command is not None])
+        errors = _run(given)
         if errors:
             failed.write_text(errors, encoding="utf-8")
+            logger.warning("kernels cannot be linked (%s); Numba compiles them", failed)
         _remove_stale(paths[0].parent)
 
 
 def _run(commands: list[list[str]]) -> str:
-    """Run commands at the same time; what those that failed have said."""
-    processes = [
-        subprocess.Popen(
-            command,
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.PIPE,
-            text=True,
-            env=inherited_imports(),
-        )
-        for command in commands
-    ]
-    try:
-        said = [process.communicate()[1] for process in processes]
-    finally:
-        for process in processes:
-            process.kill()
+    """Run commands at the same time; what those that failed have said.
+
+    They end with this process. Ctrl-C is not for them: this process may have to defer it.
+    """
+    environment = {k: v for k, v in inherited_imports().items() if not k.startswith("NUMBA_")}
+    with ExitStack() as stack:
+        started = []
+        for command in commands:
+            said = stack.enter_context(TemporaryFile())
+            process = subprocess.Popen(
+                command,
+                stdin=subprocess.PIPE,
+                stdout=subprocess.DEVNULL,
+                stderr=said,
+                env=environment,
+                start_new_session=True,
+            )
+            stack.callback(_end, process)
+            started.append((process, said))
+        for process, _ in started:
             process.wait()
-    # one that was killed may succeed the next time
-    return "".join(t for p, t in zip(processes, said, strict=True) if (p.returncode or 0) > 0)
+        errors = b""
+        for process, said in started:
+            if process.returncode > 0:  # one that was killed may succeed the next time
+                said.seek(0)
+                errors += said.read()
+    return errors.decode(errors="replace")
 
 
-def _compiler_is_there() -> bool:
-    """Whether there is the C compiler that this Python was built with, and Python's headers.
+def _end(process: subprocess.Popen[bytes]) -> None:
+    process.kill()
+    process.wait()
+    if process.stdin is not None:
+        process.stdin.close()
+
+
+def _tools_are_there() -> bool:
+    """Whether there are the compilers that this Python was built with, its headers, setuptools.
 
     On macOS the name of a compiler that is not installed opens a window, so it is not asked for.
     """
-    if not sys.platform.startswith("linux"):
+    if not sys.platform.startswith("linux") or find_spec("setuptools") is None:
         return False
-    compiler = shlex.split(os.environ.get("CC") or sysconfig.get_config_var("CC") or "")
+    compilers = [os.environ.get(name) or sysconfig.get_config_var(name) for name in ("CC", "CXX")]
     headers = Path(sysconfig.get_path("include")) / "Python.h"
-    return bool(compiler) and shutil.which(compiler[0]) is not None and headers.is_file()
+    return headers.is_file() and all(
+        compiler and shutil.which(shlex.split(compiler)[0]) for compiler in compilers
+    )
 
 
 @cache
@@ -126,7 +149,9 @@ def _digest() -> str:
     digest = hashlib.sha256()
     for path in sorted(Path(__file__).parent.glob("*.py")):
         digest.update(path.read_bytes())
-    digest.update(f"{version('numba')} {version('llvmlite')} {platform.machine()}".encode())
+    for name in ("numba", "llvmlite", "numpy"):
+        digest.update(f"{name} {version(name)} ".encode())
+    digest.update(platform.machine().encode())
     return digest.hexdigest()[:16]
 
 
@@ -158,8 +183,17 @@ def _alone_in(folder: Path) -> Iterator[None]:
 
 
 def _remove_stale(folder: Path) -> None:
-    """Remove libraries that were made long ago, for other versions of the kernels."""
+    """Remove libraries of other versions that were not used for long, and what ends left behind."""
     for path in folder.glob("kernels-*"):
         with suppress(OSError):
-            if time.time() - path.stat().st_mtime > _STALE_S:
+            if _is_recent(path, _STALE_S):
+                continue
+            if path.is_dir():
+                shutil.rmtree(path)
+            else:
                 path.unlink()
+
+
+def _is_recent(path: Path, seconds: float) -> bool:
+    """Whether a file is there and is not older than that."""
+    return path.exists() and time.time() - path.stat().st_mtime < seconds

@@ -4,14 +4,17 @@
 
 Those take half a second and some 110 MB in every process. So Numba compiles the kernels ahead of
 time, and the C compiler of the machine links them (`linking`), once for each version of their
-source. Without a C compiler they are compiled in the process itself (`compilation`).
+source. Without a compiler they are compiled in the process itself (`compilation`). Linked kernels
+hold Python's lock while they run, for some 0.1 ms; compiled ones do not.
 """
 
 from __future__ import annotations
 
+import logging
 import os
 import re
 from collections.abc import Callable
+from contextlib import suppress
 from functools import cache, wraps
 from importlib.machinery import ExtensionFileLoader
 from importlib.util import module_from_spec, spec_from_file_location
@@ -28,8 +31,12 @@ from slam_graph.kernels.library_files import library_paths, make, module_name
 
 __all__ = ["are_linked", "linked_kernel"]
 
+logger = logging.getLogger("slam_graph")
+
 _CHOICE = "SLAM_GRAPH_KERNELS"
 """If it is `numba` in the environment, kernels are compiled in the process."""
+_UNAVAILABLE = (ImportError, OSError, RuntimeError, ValueError)
+"""Not made, no folder for them, or one whose files may not be executed."""
 _NUMBERS = (int, float, np.integer, np.floating, np.bool_)
 _ARGUMENT = re.compile(r"(\w+)(?:\[([^\]]*)\])?")
 """A type in Numba's notation, and the axes if it is that of an array."""
@@ -57,12 +64,13 @@ def _libraries() -> tuple[ModuleType, ...]:
     """The libraries of all kernels; none if they are not there and cannot be made."""
     if os.environ.get(_CHOICE) == "numba":
         return ()
-    paths = library_paths()
-    if not all(path.is_file() for path in paths):
-        make(paths)
     try:
+        paths = library_paths()
+        if not all(path.is_file() for path in paths):
+            make(paths)
         return tuple(_loaded(path, module_name(part)) for part, path in enumerate(paths))
-    except (ImportError, OSError):  # not made, or in a folder whose files may not be executed
+    except _UNAVAILABLE as error:
+        logger.debug("Numba compiles the kernels: %s", error)
         return ()
 
 
@@ -73,6 +81,8 @@ def _loaded(path: Path, name: str) -> ModuleType:
     assert spec.loader is not None
     module = module_from_spec(spec)
     spec.loader.exec_module(module)
+    with suppress(OSError):
+        os.utime(path)  # it is in use
     return module
 
 
@@ -102,7 +112,7 @@ def _checked(
         for k, dtype, ndim, lies_so in arrays:  # for a hundred calls a frame: the cheapest way
             array = given[k]
             if not (
-                type(array) is _ndarray
+                isinstance(array, _ndarray)
                 and (array.dtype is dtype or array.dtype == dtype)
                 and array.ndim == ndim
                 and lies_so(array)

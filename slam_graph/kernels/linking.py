@@ -17,6 +17,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
+from slam_graph.interrupts import Interrupts
 from slam_graph.kernels import compilation
 from slam_graph.kernels.library_files import PARTS, module_name, processor
 
@@ -66,4 +67,5 @@ def _caller(kernel: Any) -> Any:
 
 
 if __name__ == "__main__":
+    Interrupts.end_with(0)
     main(int(sys.argv[1]), Path(sys.argv[2]))

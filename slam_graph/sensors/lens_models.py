@@ -138,7 +138,7 @@ class RadialTangential(_SolvedInTwoSteps):
 
     def _approached(self, q: FloatArray, coefficients: FloatArray) -> FloatArray:
         """What `cv2.undistortPointsIter` finds; it is asked for where a kernel gives up."""
-        from slam_graph.kernels.undistortion import approach_radtan  # which imports Numba
+        from slam_graph.kernels.undistortion import approach_radtan  # which loads kernels
 
         m = approach_radtan(q, coefficients, _ROUGH_ITERATIONS, _ROUGH_EPSILON)
         left = np.isnan(m[:, 0])
@@ -152,7 +152,7 @@ class RadialTangential(_SolvedInTwoSteps):
         self, q: FloatArray, coefficients: Coefficients, m: FloatArray, steps: int
     ) -> FloatArray:
         """Newton's method for each point by itself, in a kernel."""
-        from slam_graph.kernels.undistortion import undistort_radtan  # which imports Numba
+        from slam_graph.kernels.undistortion import undistort_radtan  # which loads kernels
 
         places, start = np.ascontiguousarray(q), np.ascontiguousarray(m)
         own = np.array(coefficients, np.float64)

@@ -136,11 +136,11 @@ class ClockMonitor:
             if sigma_s < known_sigma_s:
                 self._known = offset_s, sigma_s
             return None
-        self.contradicted = True
-        if not (self.knows or self._is_calibrated):  # the first estimate may have been wrong
-            if sigma_s < known_sigma_s:
-                self._known = offset_s, sigma_s
+        fits = abs(offset_s - self._nominal_s) < _AGREES_SIGMAS * sigma_s
+        if fits and not self.knows and sigma_s < known_sigma_s:
+            self._known = offset_s, sigma_s  # the first estimate was wrong, not the calibration
             return None
+        self.contradicted = True
         before_s = self._nominal_s if self._is_calibrated else known_s
         limit_s = max(_CHANGED_S, _CHANGED_SIGMAS * (sigma_s if self._is_calibrated else both_s))
         if (

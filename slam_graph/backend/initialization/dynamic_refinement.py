@@ -93,17 +93,24 @@ class DynamicRefinement:
         scale_sigma: relative standard deviation of the scale of the last solution.
     """
 
-    def __init__(self, context: EngineContext, max_scale_sigma: float) -> None:
+    def __init__(
+        self,
+        context: EngineContext,
+        max_scale_sigma: float,
+        white_noise_factor: float = _WHITE_NOISE_FACTOR,
+    ) -> None:
         """Prepare for attempts.
 
         Args:
             context: shared with the engine.
             max_scale_sigma: largest accepted standard deviation of the scale, relative to it.
+            white_noise_factor: least factor on the calibrated white noise of the IMU.
         """
         self.outliers = np.zeros(0, np.int64)
         self.scale_sigma = float("inf")
         self._context = context
         self._max_scale_sigma = max_scale_sigma
+        self._white_noise_factor = white_noise_factor
 
     def refine(
         self, frames: StartFrames, guess: StartGuess, first: NavState | None = None
@@ -268,7 +275,7 @@ class DynamicRefinement:
             change = MotionChange.between(before, samples)
             gap_s = context.imu.largest_gap_s(*samples.stamps_ns[[0, -1]].tolist())
             scale = IMU_GAP_SCALE if gap_s > context.config.noise.max_imu_gap_s else 1.0
-            params = noise.params(scale, _WHITE_NOISE_FACTOR, change)
+            params = noise.params(scale, self._white_noise_factor, change)
             factors.append(imu_factor(k, k + 1, samples.preintegrated(bias, params)))
         return factors
 

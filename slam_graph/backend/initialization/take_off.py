@@ -23,10 +23,10 @@ from slam_graph.sensors import FeatureFrame
 
 _SHORTEST_S, _LONGEST_S = 1.0, 5.0
 """How long after the standstill the motion is solved at the earliest, and at the latest."""
-_MAX_SCALE_SIGMA = 0.03
+_MAX_SCALE_SIGMA = 0.02
 """Largest standard deviation of the scale with which the estimator goes on, relative to it."""
 _MOST_FRAMES = 40
-"""Frames of the batch problem; where there are more, not all are used."""
+"""About the most frames of the batch problem; where there are more, not all are used."""
 _MIN_FRAMES = 3
 """Features that fewer of them see are not used."""
 
@@ -47,7 +47,8 @@ class TakeOff:
             context: shared with the engine.
         """
         self.done = False
-        self._refinement = DynamicRefinement(context, _MAX_SCALE_SIGMA)
+        # the noise is that of the engine, which has learned some of it since the start
+        self._refinement = DynamicRefinement(context, _MAX_SCALE_SIGMA, white_noise_factor=1.0)
         self._states: list[NavState] = []
         self._frames: list[FeatureFrame] = []
         self._next_ns = 0
