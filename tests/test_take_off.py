@@ -104,7 +104,7 @@ def estimator_for(sequence: SimulatedSequence, algorithm: str = "msckf") -> sg.E
 
 def test_the_world_and_the_states_before_stay() -> None:
     """The state at the solution is within its own and the filter's covariance of that before."""
-    sequence = lift(duration_s=4)
+    sequence = lift(duration_s=5)
     found = lifted(estimator_for(sequence), sequence)
     assert found.solved is not None
     assert not found.doubtful[-1]
