@@ -137,6 +137,16 @@ def deferred() -> Iterator[Deferred]:
         handler.restore()
 
 
+def check_deferred() -> None:
+    """Let a signal that a block around this one defers take effect, where a long wait may be cut.
+
+    Raises:
+        KeyboardInterrupt: if there was one.
+    """
+    if _deferring and threading.current_thread() is threading.main_thread():
+        _deferring[-1].check()
+
+
 def terminate_like_interrupt() -> None:
     """From now on SIGTERM does what SIGINT does then, unless it does something already."""
     if signal.getsignal(signal.SIGTERM) == signal.SIG_DFL:
@@ -187,6 +197,7 @@ class Interrupts:
     """
 
     Deferral: TypeAlias = Deferred
+    check_deferred = staticmethod(check_deferred)
     completed = staticmethod(completed)
     deferred = staticmethod(deferred)
     end_with = staticmethod(end_with)

@@ -3,6 +3,7 @@
 """Kernels in shared libraries: who makes them, that they are used, and what they refuse."""
 
 import os
+import signal
 import subprocess
 import sys
 from collections.abc import Callable
@@ -12,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from slam_graph.interrupts import Interrupts
 from slam_graph.kernels import library_files, linked
 from slam_graph.kernels.ascending import are_among
 from slam_graph.kernels.gate import observation_distances
@@ -134,6 +136,13 @@ def test_a_process_that_was_killed_has_not_failed() -> None:
     run = [[sys.executable, "-c", code] for code in (kill_itself, fail)]
     assert library_files._run(run[:1]) == ""
     assert "this one fails" in library_files._run(run)
+
+
+def test_ctrl_c_ends_the_wait_although_it_is_deferred() -> None:
+    with Interrupts.deferred() as deferral:
+        deferral(signal.SIGINT, None)
+        with pytest.raises(KeyboardInterrupt):
+            library_files._run([[sys.executable, "-c", "input()"]])
 
 
 def test_an_old_failure_is_tried_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -22,6 +22,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from tempfile import TemporaryFile
 
+from slam_graph.interrupts import Interrupts
 from slam_graph.kernels.python_process import command_of, inherited_imports
 
 __all__ = ["PARTS", "library_paths", "make", "module_name", "processor"]
@@ -34,6 +35,8 @@ _LINKING = "slam_graph.kernels.linking"
 _SUFFIX: str = sysconfig.get_config_var("EXT_SUFFIX") or ".so"
 _FAILED, _RETRY_S = ".failed", 24 * 3600.0
 """Suffix of a file that says why libraries could not be made: it is not tried again for so long."""
+_POLL_S = 0.1
+"""Time between two looks whether they are made."""
 _STALE_S = 30 * 24 * 3600.0
 """Libraries that were not used for so long are removed when others are made."""
 _X86_64_V3 = frozenset(["avx", "avx2", "bmi1", "bmi2", "f16c", "fma", "abm", "movbe", "xsave"])
@@ -95,7 +98,10 @@ def make(paths: list[Path]) -> None:
 def _run(commands: list[list[str]]) -> str:
     """Run commands at the same time; what those that failed have said.
 
-    They end with this process. Ctrl-C is not for them: this process may have to defer it.
+    They end with this process. Ctrl-C is for this one alone, also within a block that defers it.
+
+    Raises:
+        KeyboardInterrupt: after Ctrl-C.
     """
     environment = {k: v for k, v in inherited_imports().items() if not k.startswith("NUMBA_")}
     with ExitStack() as stack:
@@ -112,8 +118,9 @@ def _run(commands: list[list[str]]) -> str:
             )
             stack.callback(_end, process)
             started.append((process, said))
-        for process, _ in started:
-            process.wait()
+        while any(process.poll() is None for process, _ in started):
+            Interrupts.check_deferred()
+            time.sleep(_POLL_S)
         errors = b""
         for process, said in started:
             if process.returncode > 0:  # one that was killed may succeed the next time
