@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from slam_graph.interrupts import Interrupts
-from slam_graph.kernels import library_files, linked
+from slam_graph.kernels import library_files, library_making, linked
 from slam_graph.kernels.ascending import are_among
 from slam_graph.kernels.gate import observation_distances
 from slam_graph.kernels.spacing import apart
@@ -122,27 +122,27 @@ def test_a_library_can_be_made_anywhere(tmp_path: Path) -> None:
 
 def test_what_fails_is_not_tried_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     paths = [tmp_path / "kernels-0.so", tmp_path / "kernels-1.so"]
-    monkeypatch.setattr(library_files, "_LINKING", "slam_graph.kernels.no_such_module")
-    library_files.make(paths)
+    monkeypatch.setattr(library_making, "_LINKING", "slam_graph.kernels.no_such_module")
+    library_making.make(paths)
     said = (tmp_path / "kernels-0.failed").read_text(encoding="utf-8")
     assert said.count("no_such_module") == len(paths)
-    monkeypatch.setattr(library_files, "_run", lambda commands: pytest.fail("tried again"))
-    library_files.make(paths)
+    monkeypatch.setattr(library_making, "_run", lambda commands: pytest.fail("tried again"))
+    library_making.make(paths)
 
 
 def test_a_process_that_was_killed_has_not_failed() -> None:
     kill_itself = "import os, signal; os.kill(os.getpid(), signal.SIGKILL)"
     fail = "raise SystemExit('this one fails')"
     run = [[sys.executable, "-c", code] for code in (kill_itself, fail)]
-    assert library_files._run(run[:1]) == ""
-    assert "this one fails" in library_files._run(run)
+    assert library_making._run(run[:1]) == ""
+    assert "this one fails" in library_making._run(run)
 
 
 def test_ctrl_c_ends_the_wait_although_it_is_deferred() -> None:
     with Interrupts.deferred() as deferral:
         deferral(signal.SIGINT, None)
         with pytest.raises(KeyboardInterrupt):
-            library_files._run([[sys.executable, "-c", "input()"]])
+            library_making._run([[sys.executable, "-c", "input()"]])
 
 
 def test_an_old_failure_is_tried_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -150,8 +150,8 @@ def test_an_old_failure_is_tried_again(tmp_path: Path, monkeypatch: pytest.Monke
     failed.touch()
     os.utime(failed, (0, 0))
     tried: list[int] = []
-    monkeypatch.setattr(library_files, "_run", lambda commands: tried.append(len(commands)))
-    library_files.make([tmp_path / "kernels-0.so"])
+    monkeypatch.setattr(library_making, "_run", lambda commands: tried.append(len(commands)))
+    library_making.make([tmp_path / "kernels-0.so"])
     assert tried == [1]
 
 
@@ -159,7 +159,7 @@ def test_without_a_compiler_nothing_is_tried(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("CC", "no-such-compiler -pthread")
-    library_files.make([tmp_path / "kernels-0.so"])
+    library_making.make([tmp_path / "kernels-0.so"])
     assert not list(tmp_path.iterdir())
 
 
@@ -168,7 +168,7 @@ def test_libraries_of_long_ago_are_removed(tmp_path: Path) -> None:
     for path in (old, new):
         path.touch()
     os.utime(old, (0, 0))
-    library_files._remove_stale(tmp_path)
+    library_making._remove_stale(tmp_path)
     assert list(tmp_path.iterdir()) == [new]
 
 

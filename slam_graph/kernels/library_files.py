@@ -1,44 +1,23 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""Where the shared libraries of kernels are stored, and who makes them."""
+"""Where the shared libraries of kernels are stored."""
 
 from __future__ import annotations
 
-import hashlib
-import logging
 import os
 import platform
-import shlex
-import shutil
-import subprocess
-import sys
 import sysconfig
-import time
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import suppress
 from functools import cache
-from importlib.metadata import version
-from importlib.util import find_spec
+from importlib.util import find_spec, source_hash
 from pathlib import Path
-from tempfile import TemporaryFile
 
-from slam_graph.interrupts import Interrupts
-from slam_graph.kernels.python_process import command_of, inherited_imports
-
-__all__ = ["PARTS", "library_paths", "make", "module_name", "processor"]
-
-logger = logging.getLogger("slam_graph")
+__all__ = ["PARTS", "library_paths", "module_name", "processor"]
 
 PARTS = 2
 """Libraries that are made at the same time, each by a process of its own."""
-_LINKING = "slam_graph.kernels.linking"
 _SUFFIX: str = sysconfig.get_config_var("EXT_SUFFIX") or ".so"
-_FAILED, _RETRY_S = ".failed", 24 * 3600.0
-"""Suffix of a file that says why libraries could not be made: it is not tried again for so long."""
-_POLL_S = 0.1
-"""Time between two looks whether they are made."""
-_STALE_S = 30 * 24 * 3600.0
-"""Libraries that were not used for so long are removed when others are made."""
 _X86_64_V3 = frozenset(["avx", "avx2", "bmi1", "bmi2", "f16c", "fma", "abm", "movbe", "xsave"])
 """What x86-64-v3 has beyond the level below it, by Linux' names."""
 
@@ -68,108 +47,26 @@ def processor() -> str:
     return "generic"
 
 
-def make(paths: list[Path]) -> None:
-    """Make the libraries, or wait until another process has made them.
-
-    Where they cannot be made they are not there afterwards.
-
-    Args:
-        paths: files to make, one for each part.
-
-    Raises:
-        OSError: if nothing can be stored in their folder.
-    """
-    commands = [command_of(_LINKING, str(part), str(path)) for part, path in enumerate(paths)]
-    given = [command for command in commands if command is not None]
-    if len(given) < len(paths) or not _tools_are_there():
-        return
-    with _alone_in(paths[0].parent):
-        failed = paths[0].with_suffix(_FAILED)
-        if _is_recent(failed, _RETRY_S) or all(path.is_file() for path in paths):
-            return
-        logger.warning("compiling kernels: once on this machine, some 15 s")
-        errors = _run(given)
-        if errors:
-            failed.write_text(errors, encoding="utf-8")
-            logger.warning("kernels cannot be linked (%s); Numba compiles them", failed)
-        _remove_stale(paths[0].parent)
-
-
-def _run(commands: list[list[str]]) -> str:
-    """Run commands at the same time; what those that failed have said.
-
-    They end with this process. Ctrl-C is for this one alone, also within a block that defers it.
-
-    Raises:
-        KeyboardInterrupt: after Ctrl-C.
-    """
-    environment = {k: v for k, v in inherited_imports().items() if not k.startswith("NUMBA_")}
-    with ExitStack() as stack:
-        started = []
-        for command in commands:
-            said = stack.enter_context(TemporaryFile())
-            process = subprocess.Popen(
-                command,
-                stdin=subprocess.PIPE,
-                stdout=subprocess.DEVNULL,
-                stderr=said,
-                env=environment,
-                start_new_session=True,
-            )
-            stack.callback(_end, process)
-            started.append((process, said))
-        while any(process.poll() is None for process, _ in started):
-            Interrupts.check_deferred()
-            time.sleep(_POLL_S)
-        errors = b""
-        for process, said in started:
-            if process.returncode > 0:  # one that was killed may succeed the next time
-                said.seek(0)
-                errors += said.read()
-    return errors.decode(errors="replace")
-
-
-def _end(process: subprocess.Popen[bytes]) -> None:
-    process.kill()
-    process.wait()
-    if process.stdin is not None:
-        process.stdin.close()
-
-
-def _tools_are_there() -> bool:
-    """Whether there are the compilers that this Python was built with, its headers, setuptools.
-
-    On macOS the name of a compiler that is not installed opens a window, so it is not asked for.
-    """
-    if not sys.platform.startswith("linux") or find_spec("setuptools") is None:
-        return False
-    compilers = [os.environ.get(name) or sysconfig.get_config_var(name) for name in ("CC", "CXX")]
-    headers = Path(sysconfig.get_path("include")) / "Python.h"
-    return headers.is_file() and all(
-        compiler and shutil.which(shlex.split(compiler)[0]) for compiler in compilers
-    )
-
-
 @cache
 def _digest() -> str:
     """What tells versions apart: the source of all kernels, and what compiles it."""
-    digest = hashlib.sha256()
-    for path in sorted(Path(__file__).parent.glob("*.py")):
-        digest.update(path.read_bytes())
-    for name in ("numba", "llvmlite", "numpy"):
-        digest.update(f"{name} {version(name)} ".encode())
-    digest.update(platform.machine().encode())
-    return digest.hexdigest()[:16]
+    parts = [path.read_bytes() for path in sorted(Path(__file__).parent.glob("*.py"))]
+    for name in ("numba", "llvmlite", "numpy"):  # `importlib.metadata` takes longer than all this
+        found = find_spec(name)
+        if found is not None and found.origin is not None:
+            parts.append(f"{name} {Path(found.origin).stat().st_mtime_ns}".encode())
+    return source_hash(b"".join([*parts, platform.machine().encode()])).hex()
 
 
-def _folders() -> list[Path]:
+def _folders() -> Iterator[Path]:
     """Where libraries may be: with Numba's cache if that is set, by the modules, with the user."""
     chosen = os.environ.get("NUMBA_CACHE_DIR")
     if chosen:
-        return [Path(chosen)]
+        yield Path(chosen)
+        return
+    yield Path(__file__).parent / "__pycache__"
     user = os.environ.get("XDG_CACHE_HOME")
-    beside = Path(__file__).parent / "__pycache__"
-    return [beside, (Path(user) if user else Path.home() / ".cache") / "slam_graph"]
+    yield (Path(user) if user else Path.home() / ".cache") / "slam_graph"
 
 
 def _is_writable(folder: Path) -> bool:
@@ -177,30 +74,3 @@ def _is_writable(folder: Path) -> bool:
     with suppress(OSError):
         folder.mkdir(parents=True, exist_ok=True)
     return os.access(folder, os.W_OK)
-
-
-@contextmanager
-def _alone_in(folder: Path) -> Iterator[None]:
-    """Wait until no other process makes libraries in a folder, and let none in meanwhile."""
-    import fcntl  # not on Windows, where libraries are not made
-
-    with (folder / "kernels.lock").open("w") as file:
-        fcntl.flock(file, fcntl.LOCK_EX)
-        yield
-
-
-def _remove_stale(folder: Path) -> None:
-    """Remove libraries of other versions that were not used for long, and what ends left behind."""
-    for path in folder.glob("kernels-*"):
-        with suppress(OSError):
-            if _is_recent(path, _STALE_S):
-                continue
-            if path.is_dir():
-                shutil.rmtree(path)
-            else:
-                path.unlink()
-
-
-def _is_recent(path: Path, seconds: float) -> bool:
-    """Whether a file is there and is not older than that."""
-    return path.exists() and time.time() - path.stat().st_mtime < seconds

@@ -13,6 +13,7 @@ from __future__ import annotations
 import logging
 import os
 import re
+import sys
 from collections.abc import Callable
 from contextlib import suppress
 from functools import cache, wraps
@@ -27,7 +28,7 @@ import numpy as np
 from numpy import ndarray as _ndarray
 from numpy.typing import NDArray
 
-from slam_graph.kernels.library_files import library_paths, make, module_name
+from slam_graph.kernels.library_files import library_paths, module_name
 
 __all__ = ["are_linked", "linked_kernel"]
 
@@ -62,11 +63,14 @@ def linked_kernel(function: Callable[..., object], signature: str) -> Callable[.
 @cache
 def _libraries() -> tuple[ModuleType, ...]:
     """The libraries of all kernels; none if they are not there and cannot be made."""
-    if os.environ.get(_CHOICE) == "numba":
+    # on macOS the name of a compiler that is not installed opens a window
+    if os.environ.get(_CHOICE) == "numba" or not sys.platform.startswith("linux"):
         return ()
     try:
         paths = library_paths()
         if not all(path.is_file() for path in paths):
+            from slam_graph.kernels.library_making import make  # what few processes need
+
             make(paths)
         return tuple(_loaded(path, module_name(part)) for part, path in enumerate(paths))
     except _UNAVAILABLE as error:

@@ -1,0 +1,138 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""Has the shared libraries of kernels made, by two processes that compile and link them."""
+
+from __future__ import annotations
+
+import fcntl
+import logging
+import os
+import shlex
+import shutil
+import subprocess
+import sysconfig
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager, suppress
+from importlib.util import find_spec
+from pathlib import Path
+from tempfile import TemporaryFile
+
+from slam_graph.interrupts import Interrupts
+from slam_graph.kernels.python_process import command_of, inherited_imports
+
+__all__ = ["make"]
+
+logger = logging.getLogger("slam_graph")
+
+_LINKING = "slam_graph.kernels.linking"
+_FAILED, _RETRY_S = ".failed", 24 * 3600.0
+"""Suffix of a file that says why libraries could not be made: it is not tried again for so long."""
+_POLL_S = 0.1
+"""Time between two looks whether they are made."""
+_STALE_S = 30 * 24 * 3600.0
+"""Libraries that were not used for so long are removed when others are made."""
+
+
+def make(paths: list[Path]) -> None:
+    """Make the libraries, or wait until another process has made them.
+
+    Where they cannot be made they are not there afterwards.
+
+    Args:
+        paths: files to make, one for each part.
+
+    Raises:
+        OSError: if nothing can be stored in their folder.
+    """
+    commands = [command_of(_LINKING, str(part), str(path)) for part, path in enumerate(paths)]
+    given = [command for command in commands if command is not None]
+    if len(given) < len(paths) or not _tools_are_there():
+        return
+    with _alone_in(paths[0].parent):
+        failed = paths[0].with_suffix(_FAILED)
+        if _is_recent(failed, _RETRY_S) or all(path.is_file() for path in paths):
+            return
+        logger.warning("compiling kernels: once on this machine, some 15 s")
+        errors = _run(given)
+        if errors:
+            failed.write_text(errors, encoding="utf-8")
+            logger.warning("kernels cannot be linked (%s); Numba compiles them", failed)
+        _remove_stale(paths[0].parent)
+
+
+def _run(commands: list[list[str]]) -> str:
+    """Run commands at the same time; what those that failed have said.
+
+    They end with this process. Ctrl-C is for this one alone, also within a block that defers it.
+
+    Raises:
+        KeyboardInterrupt: after Ctrl-C.
+    """
+    environment = {k: v for k, v in inherited_imports().items() if not k.startswith("NUMBA_")}
+    with ExitStack() as stack:
+        started = []
+        for command in commands:
+            said = stack.enter_context(TemporaryFile())
+            process = subprocess.Popen(
+                command,
+                stdin=subprocess.PIPE,
+                stdout=subprocess.DEVNULL,
+                stderr=said,
+                env=environment,
+                start_new_session=True,
+            )
+            stack.callback(_end, process)
+            started.append((process, said))
+        while any(process.poll() is None for process, _ in started):
+            Interrupts.check_deferred()
+            time.sleep(_POLL_S)
+        errors = b""
+        for process, said in started:
+            if process.returncode > 0:  # one that was killed may succeed the next time
+                said.seek(0)
+                errors += said.read()
+    return errors.decode(errors="replace")
+
+
+def _end(process: subprocess.Popen[bytes]) -> None:
+    process.kill()
+    process.wait()
+    if process.stdin is not None:
+        process.stdin.close()
+
+
+def _tools_are_there() -> bool:
+    """Whether there are the compilers that this Python was built with, its headers, setuptools."""
+    if find_spec("setuptools") is None:
+        return False
+    compilers = [os.environ.get(name) or sysconfig.get_config_var(name) for name in ("CC", "CXX")]
+    headers = Path(sysconfig.get_path("include")) / "Python.h"
+    return headers.is_file() and all(
+        compiler and shutil.which(shlex.split(compiler)[0]) for compiler in compilers
+    )
+
+
+@contextmanager
+def _alone_in(folder: Path) -> Iterator[None]:
+    """Wait until no other process makes libraries in a folder, and let none in meanwhile."""
+    with (folder / "kernels.lock").open("w") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        yield
+
+
+def _remove_stale(folder: Path) -> None:
+    """Remove libraries of other versions that were not used for long, and what ends left behind."""
+    for path in folder.glob("kernels-*"):
+        with suppress(OSError):
+            if _is_recent(path, _STALE_S):
+                continue
+            if path.is_dir():
+                shutil.rmtree(path)
+            else:
+                path.unlink()
+
+
+def _is_recent(path: Path, seconds: float) -> bool:
+    """Whether a file is there and is not older than that."""
+    return path.exists() and time.time() - path.stat().st_mtime < seconds
