@@ -19,7 +19,9 @@ from slam_graph.kernels.ascending import are_among
 from slam_graph.kernels.gate import observation_distances
 from slam_graph.kernels.spacing import apart
 
-pytestmark = pytest.mark.skipif(not linked.are_linked(), reason="needs a C compiler")
+pytestmark = pytest.mark.skipif(
+    not library_making._tools_are_there(), reason="needs compilers and the headers of Python"
+)
 
 _RESULTS = """
 import sys
@@ -55,6 +57,10 @@ def _output(code: str, *arguments: str, **environment: str) -> list[str]:
         text=True,
         env={**os.environ, **environment},
     ).stdout.split()
+
+
+def test_libraries_are_used_where_they_can_be_made() -> None:
+    assert linked.are_linked()
 
 
 def test_libraries_do_without_numba_and_give_the_same_bits() -> None:

@@ -56,7 +56,7 @@ def _collect(
     function: Callable[..., object], signature: str, kernels: list[tuple[Any, str]]
 ) -> Callable[..., object]:
     """Leave it to the maker of a library when a function is compiled."""
-    import numba
+    import numba  # as below
 
     options: dict[str, Any] = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
     kernel = numba.njit(**options, **_SEMANTICS)(function)
@@ -107,7 +107,7 @@ def _tell(kernel: object) -> None:
     stats = getattr(kernel, "stats", None)
     if not _told and stats is not None and stats.cache_misses:
         _told = True
-        logger.warning("compiling kernels: once on this machine, some 15 s")
+        logger.warning("compiling kernels: once on this machine, up to a minute")
         from slam_graph.kernels.second_compiler import start_second_compiler
 
         start_second_compiler()

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""Has the shared libraries of kernels made, by two processes that compile and link them."""
+"""Makes the shared libraries of kernels, by processes that compile and link them."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def make(paths: list[Path]) -> None:
         failed = paths[0].with_suffix(_FAILED)
         if _is_recent(failed, _RETRY_S) or all(path.is_file() for path in paths):
             return
-        logger.warning("compiling kernels: once on this machine, some 15 s")
+        logger.warning("compiling kernels: once on this machine, up to a minute")
         errors = _run(given)
         if errors:
             failed.write_text(errors, encoding="utf-8")
@@ -122,7 +122,7 @@ def _alone_in(folder: Path) -> Iterator[None]:
 
 
 def _remove_stale(folder: Path) -> None:
-    """Remove libraries of other versions that were not used for long, and what ends left behind."""
+    """Remove libraries that were not used for long, and folders of processes that were killed."""
     for path in folder.glob("kernels-*"):
         with suppress(OSError):
             if _is_recent(path, _STALE_S):

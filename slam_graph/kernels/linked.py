@@ -25,7 +25,6 @@ from types import ModuleType
 from typing import Any
 
 import numpy as np
-from numpy import ndarray as _ndarray
 from numpy.typing import NDArray
 
 from slam_graph.kernels.library_files import library_paths, module_name
@@ -36,8 +35,8 @@ logger = logging.getLogger("slam_graph")
 
 _CHOICE = "SLAM_GRAPH_KERNELS"
 """If it is `numba` in the environment, kernels are compiled in the process."""
-_UNAVAILABLE = (ImportError, OSError, RuntimeError, ValueError)
-"""Not made, no folder for them, or one whose files may not be executed."""
+_UNAVAILABLE = (ImportError, LookupError, OSError, RuntimeError, ValueError)
+"""What is raised where they cannot be made, stored or loaded."""
 _NUMBERS = (int, float, np.integer, np.floating, np.bool_)
 _ARGUMENT = re.compile(r"(\w+)(?:\[([^\]]*)\])?")
 """A type in Numba's notation, and the axes if it is that of an array."""
@@ -113,13 +112,13 @@ def _checked(
     def checked(*given: Any) -> object:
         if len(given) != len(types):
             raise TypeError(f"{name} takes {len(types)} arguments, not {len(given)}")
-        for k, dtype, ndim, lies_so in arrays:  # for a hundred calls a frame: the cheapest way
+        for k, dtype, ndim, has_layout in arrays:  # for a hundred calls a frame: the cheapest way
             array = given[k]
             if not (
-                isinstance(array, _ndarray)
+                isinstance(array, np.ndarray)
                 and (array.dtype is dtype or array.dtype == dtype)
                 and array.ndim == ndim
-                and lies_so(array)
+                and has_layout(array)
             ):
                 raise TypeError(f"argument {k} of {name} does not fit {signature}")
         for k in numbers:
@@ -131,11 +130,11 @@ def _checked(
 
 
 def _layout(axes: str) -> Callable[[Any], bool]:
-    """What tells whether an array can be written to and its elements lie as its axes say."""
+    """A test whether an array is aligned, writable and laid out as its axes say."""
     if axes.endswith("::1"):
         return attrgetter("flags.carray")
-    return _is_in_columns if axes.startswith("::1") else attrgetter("flags.behaved")
+    return _is_fortran if axes.startswith("::1") else attrgetter("flags.behaved")
 
 
-def _is_in_columns(array: NDArray[Any]) -> bool:
+def _is_fortran(array: NDArray[Any]) -> bool:
     return array.flags.behaved and array.flags.f_contiguous
