@@ -104,3 +104,22 @@ def test_a_store_that_closes_forgets(monkeypatch: pytest.MonkeyPatch) -> None:
     assert L(0) in own.state.offsets
     assert L(0) not in before.layout
     assert len(own.archive.due(np.array([0, 1, 2]))) == 0
+
+
+def test_the_oldest_conditionals_are_dropped_exactly(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is still stored is what it would be had nothing been dropped; the rest is new again."""
+    bounded, joint = (Filter(aside, points="first") for aside in (True, False))
+    for frame, tracked in enumerate([{0, 1}, {1, 2}, {2, 3}, {3, 4}]):
+        if frame == 3:  # features 0 and 1 have left; only what leaves now has room
+            monkeypatch.setattr(landmark_store, "_MAX_BYTES", 8000)
+        for one in (bounded, joint):
+            one.step(frame, tracked, np.random.default_rng([7, frame]))
+    assert bounded.archive.due(np.array([0, 1, 2])).tolist() == [2]
+    for one in (bounded, joint):
+        one.step(4, {2, 3, 4}, np.random.default_rng([7, 4]))
+    keys = list(bounded.prior.layout.dims)
+    np.testing.assert_allclose(
+        bounded.prior.covariance_of(keys), joint.prior.covariance_of(keys), rtol=1e-7, atol=1e-9
+    )
+    bounded.step(5, {0, 2}, np.random.default_rng([7, 5]))
+    assert L(0) in bounded.state.offsets

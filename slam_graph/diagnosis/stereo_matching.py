@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import cv2
 import numpy as np
@@ -15,6 +16,8 @@ from slam_graph.sensors import FeatureFrame
 
 _KEYPOINTS = 700
 """SIFT keypoints of an image."""
+_PART_PX, _OVERLAP_PX = 400, 40
+"""Largest part of an image that SIFT gets, and how far it sees beyond it on each side."""
 _RATIO = 0.8
 """Lowe's ratio: the best match must be so much nearer than the second."""
 _RANSAC_PX, _CONFIDENCE = 2.0, 0.999
@@ -47,10 +50,9 @@ def match_images(
     stamp_ns: int, first: NDArray[np.uint8], second: NDArray[np.uint8]
 ) -> StereoMatches:
     """Matches of two grey images by SIFT, mutual, and consistent with one epipolar geometry."""
-    sift = cv2.SIFT.create(_KEYPOINTS)
-    (one, of_one), (two, of_two) = (sift.detectAndCompute(im, None) for im in (first, second))
+    (one, of_one), (two, of_two) = _keypoints(first), _keypoints(second)
     none = StereoMatches(stamp_ns, np.zeros((0, 2)), np.zeros((0, 2)))
-    if of_one is None or of_two is None or min(len(one), len(two)) < _MIN_MATCHES:
+    if min(len(one), len(two)) < _MIN_MATCHES:
         return none
     matcher = cv2.BFMatcher(cv2.NORM_L2)
     back = {m.queryIdx: m.trainIdx for m in matcher.match(of_two, of_one)}
@@ -61,10 +63,39 @@ def match_images(
     ]
     if len(pairs) < _MIN_MATCHES:
         return none
-    a = np.array([one[i].pt for i, _ in pairs])
-    b = np.array([two[j].pt for _, j in pairs])
+    a = one[[i for i, _ in pairs]]
+    b = two[[j for _, j in pairs]]
     _, inlier = cv2.findFundamentalMat(a, b, cv2.USAC_MAGSAC, _RANSAC_PX, _CONFIDENCE)
     if inlier is None:
         return none
     keep = inlier.ravel().astype(bool)
     return StereoMatches(stamp_ns, a[keep], b[keep])
+
+
+def _keypoints(image: NDArray[np.uint8]) -> tuple[FloatArray, NDArray[np.float32]]:
+    """The strongest SIFT keypoints of an image, pixels (N, 2), and their descriptors (N, 128).
+
+    SIFT takes 240 bytes a pixel for its scale space, so it gets one part of the image at a time.
+    """
+    sift = cv2.SIFT.create(_KEYPOINTS)
+    pixels, strengths, descriptors = [np.zeros((0, 2))], [np.zeros(0)], [np.zeros((0, 128), "f4")]
+    for top, bottom in _parts(image.shape[0]):
+        for left, right in _parts(image.shape[1]):
+            y, x = max(top - _OVERLAP_PX, 0), max(left - _OVERLAP_PX, 0)
+            part = image[y : bottom + _OVERLAP_PX, x : right + _OVERLAP_PX]
+            found, described = sift.detectAndCompute(part, None)
+            if described is None:
+                continue
+            at = cv2.KeyPoint.convert(found) + np.array([x, y])
+            inside = ((at >= (left, top)) & (at < (right, bottom))).all(axis=1)
+            pixels.append(at[inside])
+            strengths.append(np.array([point.response for point in found])[inside])
+            descriptors.append(described[inside])
+    strongest = np.argsort(-np.concatenate(strengths), kind="stable")[:_KEYPOINTS]
+    return np.concatenate(pixels)[strongest], np.concatenate(descriptors)[strongest]
+
+
+def _parts(size: int) -> list[tuple[int, int]]:
+    """Begin and end of equal parts of an image's width or height."""
+    ends = np.linspace(0, size, -(-size // _PART_PX) + 1).round().astype(int)
+    return [(int(a), int(b)) for a, b in pairwise(ends)]

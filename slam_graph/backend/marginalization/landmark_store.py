@@ -14,10 +14,14 @@ stay lost, as those of a tracker do. Where identities return all the time, each 
 all that was stored: then the store is closed. From then on lost features are marginalised for good,
 and one that comes back is a new one. What was measured of it before stays in the prior of the
 others; that it is the same point is no longer used.
+
+The oldest conditionals are dropped where all of them take too much memory. That marginalises their
+features for good as well, exactly: no later conditional depends on what an earlier one eliminated.
 """
 
 from __future__ import annotations
 
+from collections import deque
 from dataclasses import dataclass
 
 import numpy as np
@@ -35,6 +39,10 @@ from slam_graph.backend.solve.state import POINT_DIM, State, dims_of
 
 _MAX_EXCHANGES = 300
 """Work limit: after this many conditionals were reordered to recall features, the store closes."""
+
+_MAX_BYTES = 10 * 2**20
+"""Memory of all conditionals. Features that came back were at most 9 MB of them away (stereo tracks
+of openvins_sim)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -57,7 +65,8 @@ class LandmarkStore:
     def __init__(self) -> None:
         self.open = True
         self._exchanges = 0
-        self._conditionals: list[Conditional] = []
+        self._conditionals: deque[Conditional] = deque()
+        self._dropped = 0  # conditionals that are no longer there; places count from the first one
         self._places: dict[int, _Place] = {}
         self._moved: dict[int, FloatArray] = {}  # how far linearisation points are from the first
 
@@ -82,9 +91,26 @@ class LandmarkStore:
             symbol = Symbol(key)
             if symbol.chr() == ord("l"):
                 (first,) = state.positions_of(np.array([symbol.index()]), first=True)
-                self._places[symbol.index()] = _Place(len(self._conditionals), first)
+                self._places[symbol.index()] = _Place(self._end, first)
         offset = np.concatenate([state.offset(part) for part in conditional.layouts])
         self._conditionals.append(conditional.shifted(-offset - self._bases(conditional)))
+        size = sum(each.rows.nbytes for each in self._conditionals)
+        while size > _MAX_BYTES:
+            size -= self._drop_oldest()
+
+    @property
+    def _end(self) -> int:
+        """The number of the conditional to come."""
+        return self._dropped + len(self._conditionals)
+
+    def _drop_oldest(self) -> int:
+        """Marginalise what the oldest conditional eliminated for good; its size in bytes."""
+        oldest = self._conditionals.popleft()
+        for key in oldest.gone.dims:
+            self._moved.pop(key, None)
+        self._places = {j: at for j, at in self._places.items() if at.conditional > self._dropped}
+        self._dropped += 1
+        return oldest.rows.nbytes
 
     def follow(self, state: State) -> None:
         """Note that the linearisation points of all variables move to their estimates now."""
@@ -130,8 +156,8 @@ class LandmarkStore:
         carried = Conditional.nothing()
         wanted = {L(j) for j in places}
         first = min(place.conditional for place in places.values())
-        self._exchanges += len(self._conditionals) - first
-        for k in range(first, len(self._conditionals)):
+        self._exchanges += self._end - first
+        for k in range(first - self._dropped, len(self._conditionals)):
             self._conditionals[k], carried = _exchanged(self._conditionals[k], carried, wanted)
         carried = carried.shifted(self._bases(carried))
         for j, place in places.items():

@@ -255,7 +255,8 @@ class SquareRootInformation:
         Raises:
             numpy.linalg.LinAlgError: if some direction is not determined.
         """
-        return _solved(self.R, self.d)
+        # with the last row, which LAPACK does not read: `R` alone is no block of memory, so a copy
+        return _solved(self.Rd[:, :-1], self.Rd[:, -1])[:-1]
 
     def covariance(self) -> FloatArray:
         """The (n, n) covariance R⁻¹ R⁻ᵀ."""
@@ -330,7 +331,10 @@ class SquareRootInformation:
 
 
 def _solved(R: FloatArray, d: FloatArray) -> FloatArray:
-    """The solution of R x = d for an upper triangular R."""
+    """The solution of R x = d for an upper triangular R; rows below its last column are not read.
+
+    As many values follow the solution as there are such rows.
+    """
     if len(d) == 0:
         return np.zeros(0)
     x, info = lapack.dtrtrs(R, d)
