@@ -110,45 +110,6 @@ def speed(figures: Figures) -> Iterator[str]:
     yield line("", "peak memory [MB]", *memory, width=7)
 
 
-def performance(figures: Figures) -> Iterator[str]:
-    """Cost of a frame of every algorithm of the engine."""
-    yield "| | two cameras [flows] | one camera [flows] | peak memory [MB] |"
-    yield "|---|---:|---:|---:|"
-    for name in RECURSIVE:
-        stereo, mono = (f"speed_mh01_{kind}.{name}" for kind in ("stereo", "mono"))
-        yield line(
-            f"`{name}`",
-            figures(f"{stereo}.cost_mean", 1),
-            figures(f"{mono}.cost_mean", 1),
-            figures(f"{stereo}.peak_memory", 0),
-        )
-
-
-def performance_parts(figures: Figures) -> Iterator[str]:
-    """What a frame with two cameras is spent on."""
-    yield "| [flows] | " + " | ".join(f"`{name}`" for name in CORE) + " |"
-    yield "|---|" + "---:|" * len(CORE)
-    for part, label in PARTS.items():
-        keys = [f"speed_mh01_stereo.{name}.part_{part}" for name in CORE]
-        yield line(label, *(figures(key, 2) for key in keys))
-
-
-PARTS = {
-    "decoding": "decoding of images",
-    "frontend_temporal": "front end: tracking in time",
-    "frontend_ransac": "RANSAC",
-    "frontend_detect": "detection",
-    "frontend_stereo": "matching between cameras",
-    "frontend_other": "rest of the front end",
-    "backend_propagation": "back end: propagation",
-    "backend_cost": "cost construction",
-    "backend_gauss_newton": "Gauss-Newton steps",
-    "backend_marginalization": "marginalization",
-    "backend_other": "rest of the back end, start-up",
-    "other": "notes of the run",
-}
-
-
 def peers(figures: Figures) -> Iterator[str]:
     """Ours beside other systems in one run; what was not measured is left out."""
     yield "| | sensors | cost [flows] | causal: ATE [m] / orientation [deg] / covered [s] | final |"
@@ -385,8 +346,6 @@ TABLES: dict[str, Callable[[Figures], Iterator[str]]] = {
     "mono_real_imu": mono_real_imu,
     "consistency_real": consistency_real,
     "held_out": held_out,
-    "performance": performance,
-    "performance_parts": performance_parts,
     "peers": peers,
     "kernels": kernels,
     "growth": growth,

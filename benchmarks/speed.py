@@ -37,6 +37,8 @@ COST_BARS = {
     ("msckf", 1): 2.8,
 }
 """Of `cost_mean`, by algorithm and number of cameras; 2.8 is that of OpenVINS with two."""
+PROFILED = "msckf"
+"""Whose functions are told."""
 OVERLAPPED, OVERLAP_BAR = "msckf", 2.8
 """What is run with front and back end in two processes, and the bar of the time of a frame."""
 
@@ -76,6 +78,11 @@ def stereo(data: Path) -> Outcome:
             f"runs had their core for {share(shipped):.0%} and {share(timed):.0%} of the time "
             "(below 95%: other programs were running, and the real-time factor is too low)"
         ]
+    for place, row in enumerate(profile(data / RECORDING), 1):
+        name, calls, part = row
+        key = f"{PROFILED}.profile_{place}"
+        outcome.add(key, [info("calls", calls, "a frame"), info("share", 100.0 * part, "%")])
+        outcome.texts[f"{key}.name"] = name
     outcome.notes += [
         "bars apply to `cost_mean`: mean over all frames, start-up included, without decoding of "
         "PNG files, as the figure known of OpenVINS (2.8) is; nor is the final bundle adjustment "
@@ -83,6 +90,14 @@ def stereo(data: Path) -> Outcome:
         "`part_*` are means over all frames and add up to `cost_mean_decoding`",
     ]
     return outcome
+
+
+def profile(recording: Path) -> list[tuple[str, float, float]]:
+    """The functions with the most time of their own: name, calls a frame, share of the time."""
+    found: list[tuple[str, float, float]] = worker(
+        "benchmarks.speed_worker", "profiled", str(recording), PROFILED
+    )["functions"]
+    return found
 
 
 def mono(data: Path) -> Outcome:

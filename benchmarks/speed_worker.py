@@ -8,12 +8,15 @@ python -m benchmarks.speed_worker MODE RECORDING ALGORITHM [CAMERAS [SECONDS]]
 from __future__ import annotations
 
 import json
+import re
 import resource
 import sys
 import tempfile
 import time
 from collections.abc import Callable
+from cProfile import Profile
 from pathlib import Path
+from pstats import Stats
 from typing import Any
 
 from threadpoolctl import threadpool_limits
@@ -72,6 +75,43 @@ def interleaved(recording: Path, config: RunConfig) -> Table:
         "wall_s": result.ending.wall_s,
         "cpu_s": cpu_s,
     }
+
+
+def profiled(recording: Path, config: RunConfig) -> Table:
+    """The functions that take the most time of their own, decoding apart.
+
+    By the wall clock: a timer of CPU time takes longer than most of the calls that it would time.
+
+    Returns:
+        `functions`: name, calls a frame and share of the time, the largest first.
+    """
+    sequence = DecodedInTurn(recording, cameras=config.cameras)
+    profile = Profile()
+    result = profile.runcall(run, sequence, config.model_copy(update={"overlap": False}))
+    result.check()
+    rows = [
+        (name_of(*function), calls, own_s)
+        for function, (calls, _, own_s, _, _) in Stats(profile).stats.items()  # type: ignore[attr-defined]
+    ]
+    rows = [row for row in rows if row[0] != DECODING]
+    total_s, frames = sum(own_s for *_, own_s in rows), result.logs.frames
+    longest = sorted(rows, key=lambda row: -row[2])[:LONGEST]
+    return {"functions": [[name, calls / frames, own / total_s] for name, calls, own in longest]}
+
+
+LONGEST = 10
+"""How many functions of a profile are told."""
+
+DECODING = "imdecode"
+
+
+def name_of(file: str, line: int, function: str) -> str:
+    """A function of a profile as a reader finds it: its file in the package, or what made it."""
+    if file == "~":  # compiled: <imdecode>, <built-in method numpy.zeros>
+        words = function.strip("<>").removeprefix("built-in method ")
+        return re.sub(r"^slam_graph_kernels_\d\.", "kernel ", words)
+    _, _, inside = file.rpartition("/slam_graph/")
+    return f"{inside or Path(file).name}: {function}"
 
 
 class DecodedInTurn(EurocSequence):
@@ -152,6 +192,7 @@ MODES: dict[str, Callable[[Path, RunConfig], Table]] = {
     "shipped": shipped,
     "interleaved": interleaved,
     "complete": shipped,
+    "profiled": profiled,
 }
 
 
