@@ -28,11 +28,11 @@ demo: $(VENV)/.installed  ## Run on the recording that comes along (DATA=path fo
 	@$(BIN)/slam-graph compare "$(DATA)" $(if $(GROUNDTRUTH),--groundtruth "$(notdir $(DATA))=$(GROUNDTRUTH)") \
 		--algorithms ekf,iekf,msckf,swf,okvis --output results/comparison --no-progress
 
-test: $(VENV)/.installed-dev  ## Run the tests (SLAM_GRAPH_DATA=folder for those on recordings)
+test: $(VENV)/.installed-dev  ## Run the quick tests (SLAM_GRAPH_DATA=folder for those on recordings)
 	@$(BIN)/python -m pytest $(PARALLEL) $(ARGS)
 
 slow: $(VENV)/.installed-dev  ## Run the slow tests, which `make test` leaves out
-	@$(BIN)/python -m pytest -m slow $(ARGS)
+	@$(BIN)/python -m pytest $(PARALLEL) -m slow $(ARGS)
 
 lint: $(VENV)/.installed-dev  ## Check style and formatting
 	@$(BIN)/ruff check .
@@ -41,7 +41,7 @@ lint: $(VENV)/.installed-dev  ## Check style and formatting
 types: $(VENV)/.installed-dev  ## Check types
 	@$(BIN)/mypy
 
-check: lint types test  ## All of these
+check: lint types test  ## Check style and types, and run the quick tests
 
 format: $(VENV)/.installed-dev  ## Put the sources into the agreed format
 	@$(BIN)/ruff check --fix .

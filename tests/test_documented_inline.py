@@ -16,6 +16,7 @@ from documented_stock import Stock
 STEPS = inline_steps()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("step", STEPS, ids=[step.text for step in STEPS])
 def test_it_works(
     step: Step, stock: Stock, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

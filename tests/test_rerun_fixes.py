@@ -102,6 +102,7 @@ def test_fixes_that_the_gate_rejects_are_red(
     assert error[later].min() > 5.0 > np.median(error[~later])
 
 
+@pytest.mark.slow
 def test_without_use_of_the_fixes_none_are_shown(tmp_path: Path) -> None:
     viewer = RerunRecording("save", "unused", tmp_path / "unused.rrd").viewer()
     off = {"backend.gnss.enabled": False, "final_ba.enabled": False}
@@ -148,6 +149,7 @@ def test_ellipsoids_are_the_covariances(tmp_path: Path) -> None:
     assert {FIXES, FIX_SIGMA} <= set(GROWING), "or the viewer shows the last one only"
 
 
+@pytest.mark.slow
 def test_known_poses_of_a_run_are_shown_in_their_world(tmp_path: Path) -> None:
     flight = sg.simulate(
         duration_s=8.0,
@@ -166,6 +168,7 @@ def test_known_poses_of_a_run_are_shown_in_their_world(tmp_path: Path) -> None:
     assert not any(name.endswith(f"/{FIXES}") for name in rows)
 
 
+@pytest.mark.slow
 def test_a_saved_run_shows_only_what_it_used(tmp_path: Path) -> None:
     """Like the run that is watched: no fixes where they are not used."""
     flight = sg.simulate(
@@ -186,6 +189,7 @@ def test_a_saved_run_shows_only_what_it_used(tmp_path: Path) -> None:
     assert FIXES not in names
 
 
+@pytest.mark.slow
 def test_axes_and_ellipsoids_of_known_poses_are_what_was_measured(tmp_path: Path) -> None:
     rng = np.random.default_rng(4)
     sigmas = rng.uniform(0.01, 0.1, (6, 6))
