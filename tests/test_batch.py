@@ -349,6 +349,7 @@ recordings:
     assert len(set(keys)) == 3, "it is run again when the file appears, and when it changes"
 
 
+@pytest.mark.slow
 def test_a_list_is_run_from_any_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A folder of images whose times and IMU are beside the list."""
     pictures = write_image_folder(tmp_path / "lists" / "pictures")

@@ -155,6 +155,7 @@ def test_a_run_goes_on_in_a_new_segment(seed: int, by_s: float) -> None:
     assert error_m(late, late.smoothed) < 2.0 * error_m(clean, clean.smoothed)
 
 
+@pytest.mark.slow
 def test_without_recovery_a_run_goes_on_and_is_not_called_good() -> None:
     kept = "limits.recovery=false", "final_ba.enabled=false"
     result = sg.run(flight(0.03), overrides=kept)

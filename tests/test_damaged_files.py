@@ -77,7 +77,7 @@ TRUTH = "state_groundtruth_estimate0"
             for folder in ("cam0", "imu0")
             for file in ("data.csv", "sensor.yaml")
         ),
-        *("depth0/data.csv", "depth0/sensor.yaml", f"{TRUTH}/data.csv"),
+        *(slow("depth0/data.csv"), "depth0/sensor.yaml", f"{TRUTH}/data.csv"),
         slow(f"{TRUTH}/sensor.yaml"),
     ],
 )

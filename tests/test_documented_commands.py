@@ -122,6 +122,7 @@ def test_demo_prints_what_is_shown(demo: list[str]) -> None:
     assert shown[4] == demo[3], "how much was read"
 
 
+@pytest.mark.slow
 def test_a_truth_adds_the_tables_that_are_shown(tmp_path: Path) -> None:
     """Their rows and columns; the numbers are of the real recording."""
     printed_by("simulate", "flight", "--duration", "5", "--no-progress", cwd=tmp_path)

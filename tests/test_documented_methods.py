@@ -11,10 +11,11 @@ from documented_stock import Stock
 from groups import slow_but
 
 LONG = {
+    *("docs/algorithms.md", "docs/loop_closure.md", "docs/engine.md"),
     *("docs/comparison.md", "docs/configuration.md", "docs/frontend.md", "docs/maps.md"),
     *("docs/moving_objects.md", "docs/results.md", "docs/visualization.md", "docs/without_imu.md"),
 }
-"""Pages that take more than four seconds; `make slow` does them."""
+"""Pages that take more than three seconds; `make slow` does them."""
 PAGES = pages_of("methods")
 
 

@@ -64,6 +64,7 @@ def simulated(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict]:
     return folder, json.loads(done.stdout)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("cameras", "alignment"), [(2, "se3"), slow(1, "sim3")])
 def test_without_an_imu_errors_are_aligned_in_what_nothing_measured(
     here: None, tmp_path: Path, cameras: int, alignment: str
@@ -206,6 +207,7 @@ def test_a_recording_of_tracks_with_its_truth(data_dir: Path, tmp_path: Path) ->
     assert all(row["status"] == {"ok": 1} and row["ate_m"]["yaw"] < 0.1 for row in rows)
 
 
+@pytest.mark.slow
 def test_an_interruption_keeps_what_is_done(tmp_path: Path) -> None:
     arguments = [
         "sim:figure8",

@@ -227,6 +227,7 @@ def test_a_flight_ends_in_the_world_of_the_poses(algorithm: str, imu: bool) -> N
     assert error_m(sequence, result) < 0.04
 
 
+@pytest.mark.slow
 def test_positions_alone_and_orientations_alone() -> None:
     sequence = flight(1, True, rotation_sigma_rad=None)
     assert error_m(sequence, estimated(sequence)) < 0.06

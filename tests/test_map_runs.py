@@ -74,6 +74,7 @@ def test_the_second_half_is_located_in_the_map_of_the_first(second: Path) -> Non
         assert ate["rotation_deg"]["max"] < WITHIN_DEG
 
 
+@pytest.mark.slow
 def test_maps_of_both_halves_become_one(tour: Path, known: Path, second: Path) -> None:
     merged = tour / "merged.slam"
     arguments = ("map", "merge", known, second, "--output", merged)

@@ -188,7 +188,7 @@ result.check()
 
 @pytest.mark.parametrize(
     ("number", "to_all"),
-    [(signal.SIGINT, True), slow(signal.SIGTERM, True), (signal.SIGKILL, False)],
+    [(signal.SIGINT, True), slow(signal.SIGTERM, True), slow(signal.SIGKILL, False)],
 )
 def test_no_process_is_left(flight: Path, number: signal.Signals, to_all: bool) -> None:
     """After a signal to the whole group, as from a terminal, or to the back end alone."""

@@ -105,6 +105,7 @@ def test_time_between_segments_is_not_covered(blind: RunResult, tmp_path: Path) 
     assert sum(int(row["states"]) for row in rows) == len(stamps)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "fault", [slow("imu_missing:at_s=6,duration_s=1.5"), "frames_dropped:at_s=6"]
 )

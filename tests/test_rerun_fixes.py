@@ -65,6 +65,7 @@ def shown(rows: Mapping[str, list[Row]]) -> tuple[FloatArray, list[tuple[int, in
     return places, [colour(packed) for row in rows[entity] for packed in row["colors"]]
 
 
+@pytest.mark.slow
 def test_all_fixes_are_in_the_world_of_the_fixes(
     watched: tuple[RunResult, Mapping[str, list[Row]]],
 ) -> None:
@@ -82,6 +83,7 @@ def test_all_fixes_are_in_the_world_of_the_fixes(
     assert np.median(np.linalg.norm(places[begun:, None] - path, axis=2).min(axis=1)) < 2.0
 
 
+@pytest.mark.slow
 def test_fixes_that_the_gate_rejects_are_red(
     watched: tuple[RunResult, Mapping[str, list[Row]]],
 ) -> None:
@@ -111,6 +113,7 @@ def test_without_use_of_the_fixes_none_are_shown(tmp_path: Path) -> None:
     assert not any(FIXES in name.split("/") for name in rows_of(tmp_path / "unused.rrd"))
 
 
+@pytest.mark.slow
 def test_a_saved_run_shows_the_fixes_of_its_recording(
     watched: tuple[RunResult, Mapping[str, list[Row]]], tmp_path: Path
 ) -> None:
@@ -149,7 +152,6 @@ def test_ellipsoids_are_the_covariances(tmp_path: Path) -> None:
     assert {FIXES, FIX_SIGMA} <= set(GROWING), "or the viewer shows the last one only"
 
 
-@pytest.mark.slow
 def test_known_poses_of_a_run_are_shown_in_their_world(tmp_path: Path) -> None:
     flight = sg.simulate(
         duration_s=8.0,
@@ -189,7 +191,6 @@ def test_a_saved_run_shows_only_what_it_used(tmp_path: Path) -> None:
     assert FIXES not in names
 
 
-@pytest.mark.slow
 def test_axes_and_ellipsoids_of_known_poses_are_what_was_measured(tmp_path: Path) -> None:
     rng = np.random.default_rng(4)
     sigmas = rng.uniform(0.01, 0.1, (6, 6))

@@ -263,7 +263,7 @@ def test_damaged_results_are_done_again(tmp_path: Path) -> None:
         assert task.is_done()
 
 
-@pytest.mark.parametrize("ignored", [False, True], ids=["foreground", "background"])
+@pytest.mark.parametrize("ignored", [False, slow(True)], ids=["foreground", "background"])
 @pytest.mark.parametrize("by", ["pipe", slow("stop")])
 def test_a_task_ends_with_the_one_who_waits_for_it(tmp_path: Path, ignored: bool, by: str) -> None:
     """When that one is gone, or stops it; also where a shell lets Ctrl-C be ignored."""

@@ -76,6 +76,7 @@ def test_a_smoother_gives_back_its_prior(name: str) -> None:
     assert solver.estimate(keys).atPose3(X(0)).equals(turned, 1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.data
 @pytest.mark.parametrize("name", slow_but({"fixed_lag_isam2"}, SOLVERS))
 def test_the_wheels_tracks(data_dir: Path, name: str) -> None:

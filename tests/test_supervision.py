@@ -80,6 +80,7 @@ def outcome(sequence: Any, algorithm: str, cameras: int, refused: bool = True) -
     return run(sequence, load_config(None, settings, algorithm=algorithm, cameras=cameras))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("cameras", [1, 2])
 @pytest.mark.parametrize("algorithm", ["msckf", slow("okvis")])
 def test_cameras_that_are_mounted_otherwise_make_a_run_diverge(
