@@ -64,8 +64,8 @@ clean:  ## Remove what was built, installed and cached, but no results
 	rm -rf $(VENV) build dist .pytest_cache .hypothesis .mypy_cache .ruff_cache
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
-# The stamps: installed again only when a requirement or a pin has changed. The second and third
-# installation contain the first.
+# The stamps: installed again only when a requirement or a pin has changed. The second installation
+# contains the others, the third the first.
 
 $(VENV)/.installed: pyproject.toml constraints.txt
 	@$(call install,.)
@@ -73,7 +73,7 @@ $(VENV)/.installed: pyproject.toml constraints.txt
 
 $(VENV)/.installed-dev: pyproject.toml constraints.txt
 	@$(call install,.[dev])
-	@touch $(VENV)/.installed $@
+	@touch $(VENV)/.installed $(VENV)/.installed-docs $@
 
 $(VENV)/.installed-docs: pyproject.toml constraints.txt
 	@$(call install,.[docs])
