@@ -28,11 +28,11 @@ demo: $(VENV)/.installed  ## Run on the recording that comes along (DATA=path fo
 	@$(BIN)/slam-graph compare "$(DATA)" $(if $(GROUNDTRUTH),--groundtruth "$(notdir $(DATA))=$(GROUNDTRUTH)") \
 		--algorithms ekf,iekf,msckf,swf,okvis --output results/comparison --no-progress
 
-test: $(VENV)/.installed-dev  ## Run the tests (SLAM_GRAPH_DATA=folder for those on recordings)
+test: $(VENV)/.installed-dev  ## Run the quick tests (SLAM_GRAPH_DATA=folder for those on recordings)
 	@$(BIN)/python -m pytest $(PARALLEL) $(ARGS)
 
 slow: $(VENV)/.installed-dev  ## Run the slow tests, which `make test` leaves out
-	@$(BIN)/python -m pytest -m slow $(ARGS)
+	@$(BIN)/python -m pytest $(PARALLEL) -m slow $(ARGS)
 
 lint: $(VENV)/.installed-dev  ## Check style and formatting
 	@$(BIN)/ruff check .
@@ -41,7 +41,7 @@ lint: $(VENV)/.installed-dev  ## Check style and formatting
 types: $(VENV)/.installed-dev  ## Check types
 	@$(BIN)/mypy
 
-check: lint types test  ## All of these
+check: lint types test  ## Check style and types, and run the quick tests
 
 format: $(VENV)/.installed-dev  ## Put the sources into the agreed format
 	@$(BIN)/ruff check --fix .
@@ -64,8 +64,8 @@ clean:  ## Remove what was built, installed and cached, but no results
 	rm -rf $(VENV) build dist .pytest_cache .hypothesis .mypy_cache .ruff_cache
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
-# The stamps: installed again only when a requirement or a pin has changed. The second and third
-# installation contain the first.
+# The stamps: installed again only when a requirement or a pin has changed. The second installation
+# contains the others, the third the first.
 
 $(VENV)/.installed: pyproject.toml constraints.txt
 	@$(call install,.)
@@ -73,7 +73,7 @@ $(VENV)/.installed: pyproject.toml constraints.txt
 
 $(VENV)/.installed-dev: pyproject.toml constraints.txt
 	@$(call install,.[dev])
-	@touch $(VENV)/.installed $@
+	@touch $(VENV)/.installed $(VENV)/.installed-docs $@
 
 $(VENV)/.installed-docs: pyproject.toml constraints.txt
 	@$(call install,.[docs])

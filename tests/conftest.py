@@ -26,11 +26,12 @@ def pytest_sessionstart(session: pytest.Session) -> None:
 
 
 LONGEST = (
-    "notebooks", "diagnosis", "verdict", "recovery", "documented_methods", "experiment",
-    "damaged_files", "position_fixes", "policy_product", "without_imu", "batch", "clock_monitor",
-    "documented_start", "documented_recordings", "map_runs", "documented_commands",
+    "damaged_files", "diagnosis", "verdict", "recovery", "position_fixes", "experiment",
+    "map_runs", "estimator_end_to_end", "repeats", "notebooks", "clock_monitor", "signals",
+    "rolling_shutter", "final_ba", "rerun", "view_damaged", "damaged_results",
 )  # fmt: skip
-"""Files of tests that take a minute or two each; they run first, so that no core ends with one."""
+"""Files of tests that take longest in the quick group; they run first, so that no core ends with
+one."""
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -145,12 +145,14 @@ def mean_nees(noise_scale: float, adaptive: bool) -> float:
     return float(values.pose.mean())
 
 
+@pytest.mark.slow
 def test_an_imu_much_noisier_than_its_calibration_is_found_out() -> None:
     believing = mean_nees(12.0, adaptive=False)
     learning = mean_nees(12.0, adaptive=True)
     assert learning < 0.35 * believing
 
 
+@pytest.mark.slow
 def test_nothing_changes_where_the_calibration_is_right() -> None:
     believing = mean_nees(1.0, adaptive=False)
     learning = mean_nees(1.0, adaptive=True)

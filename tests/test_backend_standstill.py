@@ -9,6 +9,7 @@ import gtsam
 import numpy as np
 import pytest
 from flight import AT_REST, packets, rig, room
+from groups import slow
 from gtsam.symbol_shorthand import V, X
 
 from slam_graph.arrays import FloatArray
@@ -185,7 +186,7 @@ def distance_m(trajectory: Trajectory) -> float:
     return float(np.max(np.linalg.norm(trajectory.positions - trajectory.positions[0], axis=1)))
 
 
-@pytest.mark.parametrize("cameras", [1, 2])
+@pytest.mark.parametrize("cameras", [slow(1), 2])
 def test_a_platform_at_rest_stays_within_millimetres(cameras: int) -> None:
     """Ten seconds after the start, with the noise and biases of a real IMU."""
     rng, mounted = np.random.default_rng(3), rig(cameras)
@@ -233,7 +234,7 @@ def test_real_images_before_take_off(data_dir: Path, cameras: int) -> None:
     assert np.linalg.norm(trajectory.velocities, axis=1).max() < 0.01
 
 
-@pytest.mark.parametrize("algorithm", ["msckf", "swf", "okvis", "ekf"])
+@pytest.mark.parametrize("algorithm", ["msckf", slow("swf"), slow("okvis"), slow("ekf")])
 def test_a_stop_during_a_flight_loses_nothing(algorithm: str) -> None:
     """Whatever knows the past, prior or features: a stop of three seconds moves no estimate.
 

@@ -148,6 +148,7 @@ def worker_of(out: Path, name: str) -> int:
     raise AssertionError("no worker")
 
 
+@pytest.mark.slow
 def test_an_interruption_keeps_what_is_done_and_writes_the_summary(tmp_path: Path) -> None:
     for seed in range(2):
         flight(tmp_path / "data" / f"flight_{seed}", seed)
@@ -170,6 +171,7 @@ def test_an_interruption_keeps_what_is_done_and_writes_the_summary(tmp_path: Pat
     assert [path.name for path in out.iterdir() if path.is_dir()] == ["flight_0"]
 
 
+@pytest.mark.slow
 def test_an_interruption_stops_all_runs_that_go_on(tmp_path: Path) -> None:
     """Three at once: one has ended, two leave nothing, and the next call does these two."""
     flight(tmp_path / "data" / "flight_0", 0, 1.0)
@@ -347,6 +349,7 @@ recordings:
     assert len(set(keys)) == 3, "it is run again when the file appears, and when it changes"
 
 
+@pytest.mark.slow
 def test_a_list_is_run_from_any_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A folder of images whose times and IMU are beside the list."""
     pictures = write_image_folder(tmp_path / "lists" / "pictures")
@@ -442,6 +445,7 @@ def test_runs_without_an_estimate_or_a_truth_are_in_the_summary(tmp_path: Path) 
     assert "1 recordings: 1 not_initialized" in done.stdout
 
 
+@pytest.mark.slow
 def test_a_dask_cluster_does_the_same(flights: Path, tmp_path: Path) -> None:
     distributed = pytest.importorskip("distributed")
     cluster = distributed.LocalCluster(

@@ -381,6 +381,7 @@ def test_a_run_is_missed_if_it_is_harmed_and_ends_well_and_held_out_ones_count_a
     assert alarms == pytest.approx(1.0)
 
 
+@pytest.mark.slow
 def test_a_long_flight_is_measured_in_a_process_of_its_own() -> None:
     table = speed.worker("benchmarks.memory_worker", "msckf", "1")
     assert table["frames"] == 11

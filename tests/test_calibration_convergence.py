@@ -164,6 +164,7 @@ def test_all_are_found_together() -> None:
     assert error_m(state) < 0.006
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["swf", "okvis", "ekf", "iekf"])
 def test_every_algorithm_calibrates(name: str) -> None:
     true = rig(1)

@@ -39,6 +39,7 @@ def test_keyframes_reach_as_far_back_whichever_camera_is_lost(tracks: RecordedSe
     assert first == pytest.approx(second, rel=0.3)
 
 
+@pytest.mark.slow
 @pytest.mark.data
 def test_the_second_camera_goes_on_alone_on_real_images(data_dir: Path) -> None:
     """After six seconds nothing is left of what the first one saw."""

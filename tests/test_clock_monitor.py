@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from groups import slow, slow_but
 
 import slam_graph as sg
 from slam_graph.backend import BackendConfig
@@ -66,8 +67,8 @@ def error_m(result: RunResult, estimate: Trajectory) -> float:
     return ape(result.groundtruth, estimate, alignment="yaw").statistics.rmse
 
 
-@pytest.mark.parametrize("by_s", [0.03, -0.03, 0.08])
-@pytest.mark.parametrize("seed", [1, 3])
+@pytest.mark.parametrize("by_s", [slow(0.03), -0.03, slow(0.08)])
+@pytest.mark.parametrize("seed", [slow(1), 3])
 def test_a_change_is_found_when_and_as_large_as_it_is(by_s: float, seed: int) -> None:
     """Within five seconds. Of a later clock the gap in the stamps tells the exact time."""
     recording = flight(by_s, seed)
@@ -81,7 +82,7 @@ def test_a_change_is_found_when_and_as_large_as_it_is(by_s: float, seed: int) ->
         assert 0 <= change.since_ns - begin_ns - round(by_s * 1e9) < 10_000_000
 
 
-@pytest.mark.parametrize("rate_hz", [5.0, 9.66, 12.0, 20.0])
+@pytest.mark.parametrize("rate_hz", [5.0, 9.66, 12.0, slow(20.0)])
 def test_a_change_is_found_later_as_well_whatever_the_rate(rate_hz: float) -> None:
     """After the calibration was checked, by a few rotations a second."""
     recording = flight(0.03, rate_hz=rate_hz)
@@ -90,13 +91,13 @@ def test_a_change_is_found_later_as_well_whatever_the_rate(rate_hz: float) -> No
     assert change.shift_s == pytest.approx(0.03, abs=1e-4)
 
 
-@pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.parametrize("seed", [slow(1), 2, slow(3)])
 @pytest.mark.parametrize("done", [False, True])
 def test_a_clock_that_stays_is_left_alone(seed: int, done: bool) -> None:
     assert not changes(flight(seed=seed, duration_s=30.0), done)
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", slow_but({0, 2}, range(4)))
 @pytest.mark.parametrize("by_s", [-0.009, 0.012])
 def test_an_offset_that_is_wrong_all_the_time_is_no_change(by_s: float, seed: int) -> None:
     made = sg.simulate(trajectory="random", duration_s=20.0, rate_hz=10.0, seed=seed)
@@ -137,7 +138,7 @@ def test_samples_are_put_on_the_old_clock() -> None:
     assert len(too_much) == 196  # four would be before the last sample on the old clock
 
 
-@pytest.mark.parametrize(("seed", "by_s"), [(3, 0.03), (4, -0.06)])
+@pytest.mark.parametrize(("seed", "by_s"), [slow(3, 0.03), (4, -0.06)])
 def test_a_run_goes_on_in_a_new_segment(seed: int, by_s: float) -> None:
     """Within five seconds, and as well as a clean run does; the whole is as good when smoothed."""
     clean, late = sg.run(flight(seed=seed)), sg.run(flight(by_s, seed=seed))
@@ -154,6 +155,7 @@ def test_a_run_goes_on_in_a_new_segment(seed: int, by_s: float) -> None:
     assert error_m(late, late.smoothed) < 2.0 * error_m(clean, clean.smoothed)
 
 
+@pytest.mark.slow
 def test_without_recovery_a_run_goes_on_and_is_not_called_good() -> None:
     kept = "limits.recovery=false", "final_ba.enabled=false"
     result = sg.run(flight(0.03), overrides=kept)

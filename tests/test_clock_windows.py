@@ -7,6 +7,7 @@ from collections.abc import Mapping
 
 import numpy as np
 import pytest
+from groups import slow
 
 import slam_graph as sg
 from slam_graph.config import load_config
@@ -57,7 +58,7 @@ def between_s(values: Mapping[str, object]) -> tuple[float, float]:
     return between[0], between[1]
 
 
-@pytest.mark.parametrize(("by_s", "readout_s"), [(0.03, None), (-0.03, 0.03), (0.08, None)])
+@pytest.mark.parametrize(("by_s", "readout_s"), [(0.03, None), slow(-0.03, 0.03), (0.08, None)])
 def test_the_offset_of_each_window_is_found(by_s: float, readout_s: float | None) -> None:
     """As in the calibration, also where its rows are exposed one after the other."""
     found = windows(f"imu_late:at_s={CHANGES_S},by_s={by_s}", readout_s=readout_s)
@@ -138,6 +139,7 @@ def test_what_is_plainer_comes_before_a_change() -> None:
     assert found.with_clocks(Diagnosis([])).findings == found.findings
 
 
+@pytest.mark.slow
 def test_doctor_names_a_change() -> None:
     """And no single offset of the whole recording."""
     flight = sg.simulate(trajectory="random", duration_s=20.0, rate_hz=10.0, seed=3)
@@ -146,6 +148,7 @@ def test_doctor_names_a_change() -> None:
         assert [finding.kind for finding in diagnosis.setup_faults] == named
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("late_from_s", "seconds", "between"), [(9, 20.0, "4 and 12"), (33, 44.0, r"2\d and 3\d")]
 )

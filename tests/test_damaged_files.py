@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 import pytest
 from damage import tried
+from groups import slow
 from map_flights import World
 from pose_graphs import laps
 from recordings import (
@@ -76,7 +77,8 @@ TRUTH = "state_groundtruth_estimate0"
             for folder in ("cam0", "imu0")
             for file in ("data.csv", "sensor.yaml")
         ),
-        *("depth0/data.csv", "depth0/sensor.yaml", f"{TRUTH}/data.csv", f"{TRUTH}/sensor.yaml"),
+        *(slow("depth0/data.csv"), "depth0/sensor.yaml", f"{TRUTH}/data.csv"),
+        slow(f"{TRUTH}/sensor.yaml"),
     ],
 )
 def test_euroc(tmp_path: Path, name: str) -> None:
@@ -243,7 +245,7 @@ def test_eqvio(tmp_path: Path) -> None:
     tried(path, lambda: sound_dataset(path))
 
 
-@pytest.mark.parametrize("name", ["rgb.txt", "depth.txt"])
+@pytest.mark.parametrize("name", [slow("rgb.txt"), "depth.txt"])
 def test_tum_rgbd(tmp_path: Path, name: str) -> None:
     folder = write_tum_rgbd(tmp_path / "flight_freiburg1", frames=3, size=SIZE)
     chain = tmp_path / "chain.yaml"
@@ -254,7 +256,7 @@ def test_tum_rgbd(tmp_path: Path, name: str) -> None:
 @pytest.mark.parametrize(
     "name",
     [
-        *("calib_cam_to_cam.txt", "calib_imu_to_velo.txt", "calib_velo_to_cam.txt"),
+        *("calib_cam_to_cam.txt", slow("calib_imu_to_velo.txt"), slow("calib_velo_to_cam.txt")),
         *("timestamps.txt", "0000000001.txt"),
     ],
 )
@@ -430,14 +432,14 @@ SHADES = [np.full((48, 64), shade, np.uint8) for shade in (40, 90, 160)]
 
 @pytest.mark.parametrize(
     ("name", "codec"),
-    [("flight.mkv", "FFV1"), ("flight.avi", "MJPG"), ("flight.mp4", "mp4v")],
+    [("flight.mkv", "FFV1"), ("flight.avi", "MJPG"), slow("flight.mp4", "mp4v")],
 )
 def test_videos(tmp_path: Path, name: str, codec: str) -> None:
     path = write_video(tmp_path, name, codec, SHADES)
     tried(path, lambda: sound_dataset(path))
 
 
-@pytest.mark.parametrize("name", ["flight.csv", "flight.imu.csv", "flight.yaml"])
+@pytest.mark.parametrize("name", ["flight.csv", slow("flight.imu.csv"), "flight.yaml"])
 def test_what_lies_beside_a_video(tmp_path: Path, name: str) -> None:
     path = write_flight_video(tmp_path, SHADES)
     shorten(path.with_suffix(".imu.csv"), 50)

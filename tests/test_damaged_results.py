@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 from damage import CAMPAIGN, tried
+from groups import slow
 from sound import sound_rig, sound_stamps, sound_table, sound_trajectory
 
 import slam_graph as sg
@@ -98,9 +99,9 @@ def read_run(run: SavedRun) -> None:
 @pytest.mark.parametrize(
     "name",
     [
-        *("metrics.json", "map.ply", "trajectory.tum", "trajectory_smoothed.tum"),
-        *("trajectory_loop.tum", "trajectory_map.tum", "groundtruth.tum"),
-        *("states.csv", "states_smoothed.csv", "frames.csv", "timing.csv", "loops.csv"),
+        *("metrics.json", "map.ply", "trajectory.tum", slow("trajectory_smoothed.tum")),
+        *(slow("trajectory_loop.tum"), slow("trajectory_map.tum"), "groundtruth.tum"),
+        *("states.csv", slow("states_smoothed.csv"), "frames.csv", "timing.csv", "loops.csv"),
     ],
 )
 def test_runs(saved: Path, tmp_path: Path, name: str) -> None:

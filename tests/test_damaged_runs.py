@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 from damage import tried
 from generated_rigs import rigs
+from groups import slow, slow_but
 from hypothesis import given
 from hypothesis import strategies as st
 from properties import examples, parsed, poses
@@ -78,8 +79,8 @@ def without_start(flight: Path, folder: Path) -> Path:
     return folder
 
 
-@pytest.mark.parametrize("start", ["given", "sought"])
-@pytest.mark.parametrize("algorithm", ALGORITHMS)
+@pytest.mark.parametrize("start", [slow("given"), "sought"])
+@pytest.mark.parametrize("algorithm", slow_but({"msckf"}, ALGORITHMS))
 def test_calibrations(flight: Path, tmp_path: Path, algorithm: str, start: str) -> None:
     copied = tmp_path / "flight"
     folder = shutil.copytree(flight, copied) if start == "given" else without_start(flight, copied)
@@ -113,7 +114,7 @@ def wrong(draw: st.DrawFn, rig: Rig) -> Rig:
     return Rig(tuple(mounted), noise)
 
 
-@pytest.mark.parametrize("algorithm", ALGORITHMS)
+@pytest.mark.parametrize("algorithm", slow_but({"msckf", "swf"}, ALGORITHMS))
 @examples(2)
 @given(data=st.data())
 def test_calibrations_of_any_sensors(

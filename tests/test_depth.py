@@ -294,6 +294,7 @@ def pose_at(truth: Trajectory, stamp_ns: int) -> tuple[Floats, Floats]:
     return turn.as_matrix(), (1 - part) * truth.positions[k - 1] + part * truth.positions[k]
 
 
+@pytest.mark.slow
 def test_real_depths_and_true_motion_predict_each_other(data_dir: Path) -> None:
     """TUM RGB-D: depths of a feature in two frames agree through the motion-captured path.
 

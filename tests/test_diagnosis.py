@@ -10,6 +10,7 @@ from pathlib import Path
 import gtsam
 import numpy as np
 import pytest
+from groups import slow
 from typer.testing import CliRunner
 
 import slam_graph as sg
@@ -117,7 +118,11 @@ def test_sound_tracks_have_no_faults(real_tracks: Recorded, stereo_tracks: Recor
 
 @pytest.mark.parametrize(
     ("unit", "kind"),
-    [(1 / 9.81, "accelerometer_unit"), (1e3, "accelerometer_unit"), (-1.0, "accelerometer_sign")],
+    [
+        (1 / 9.81, "accelerometer_unit"),
+        slow(1e3, "accelerometer_unit"),
+        (-1.0, "accelerometer_sign"),
+    ],
 )
 def test_forces_in_another_unit_or_sign(real_tracks: Recorded, unit: float, kind: str) -> None:
     first(judged(real_tracks, accel=unit * np.eye(3)), kind)
@@ -172,12 +177,13 @@ def test_rates_in_degrees(real_tracks: Recorded) -> None:
 
 @pytest.mark.parametrize(
     ("axes", "text"),
-    [(np.diag([1.0, -1.0, 1.0]), "(x, -y, z)"), (np.eye(3)[[1, 0, 2]], "(y, x, z)")],
+    [(np.diag([1.0, -1.0, 1.0]), "(x, -y, z)"), slow(np.eye(3)[[1, 0, 2]], "(y, x, z)")],
 )
 def test_left_handed_gyroscope(real_tracks: Recorded, axes: FloatArray, text: str) -> None:
     assert first(judged(real_tracks, gyro=axes), "gyroscope_axes")["axes"] == text
 
 
+@pytest.mark.slow
 def test_axes_of_the_accelerometer(real_tracks: Recorded) -> None:
     swapped = np.eye(3)[[1, 0, 2]]
     assert first(judged(real_tracks, accel=swapped), "accelerometer_axes")["axes"] == "(y, x, z)"
@@ -199,7 +205,7 @@ def test_axes_of_the_whole_imu(real_tracks: Recorded) -> None:
     assert values["explanation"] == "axes"
 
 
-@pytest.mark.parametrize("offset_s", [0.05, -0.05, 0.012])
+@pytest.mark.parametrize("offset_s", [slow(0.05), slow(-0.05), 0.012])
 def test_time_offset_is_found_to_milliseconds(real_tracks: Recorded, offset_s: float) -> None:
     rig = changed(real_tracks[0], lambda c: replace(c, time_offset_s=c.time_offset_s + offset_s))
     diagnosis = judged(real_tracks, rig)
@@ -207,7 +213,7 @@ def test_time_offset_is_found_to_milliseconds(real_tracks: Recorded, offset_s: f
     assert "backend.calibration.time_offset=true" in diagnosis.best_guess()
 
 
-@pytest.mark.parametrize("factor", [1.1, 1.3, 0.9])
+@pytest.mark.parametrize("factor", [slow(1.1), slow(1.3), 0.9])
 def test_focal_length(stereo_tracks: Recorded, factor: float) -> None:
     rig = changed(stereo_tracks[0], lambda c: magnified(c, factor))
     assert first(judged(stereo_tracks, rig), "focal_length")["factor"] == pytest.approx(
@@ -216,7 +222,8 @@ def test_focal_length(stereo_tracks: Recorded, factor: float) -> None:
 
 
 @pytest.mark.parametrize(
-    ("seed", "factor", "seconds"), [(3, 0.9, 14), (4, 0.9, 14), (3, 0.7, 14), (4, 0.7, 7)]
+    ("seed", "factor", "seconds"),
+    [slow(3, 0.9, 14), slow(4, 0.9, 14), slow(3, 0.7, 14), (4, 0.7, 7)],
 )
 def test_focal_length_of_a_wide_lens(
     tmp_path: Path, seed: int, factor: float, seconds: float
@@ -244,7 +251,7 @@ def test_focal_length_of_a_wide_lens(
     assert found == pytest.approx(factor, rel=0.03)
 
 
-@pytest.mark.parametrize("factor", [2.0, 0.5])
+@pytest.mark.parametrize("factor", [slow(2.0), 0.5])
 def test_baseline(stereo_tracks: Recorded, factor: float) -> None:
     def longer(poses: list[gtsam.Pose3]) -> list[gtsam.Pose3]:
         relative = poses[0].between(poses[1])
@@ -258,7 +265,7 @@ def test_baseline(stereo_tracks: Recorded, factor: float) -> None:
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        (lambda poses: poses[::-1], "the poses of the cameras are exchanged"),
+        slow(lambda poses: poses[::-1], "the poses of the cameras are exchanged"),
         (lambda poses: [poses[0], poses[1].inverse()], "the pose of cam1 is inverted"),
         (lambda poses: [poses[0], poses[1] * TURN_5], "off by 5."),
     ],
@@ -285,6 +292,7 @@ def test_both_focal_lengths_without_a_gyroscope(stereo_tracks: Recorded) -> None
     assert "focal lengths of both cameras are 1.2" in found[0].what  # they are known to a tenth
 
 
+@pytest.mark.slow
 def test_focal_length_of_the_second_camera(stereo_tracks: Recorded) -> None:
     one, two = stereo_tracks[0].cameras
     diagnosis = judged(stereo_tracks, Rig((one, magnified(two, 1.1)), stereo_tracks[0].imu))
@@ -292,6 +300,7 @@ def test_focal_length_of_the_second_camera(stereo_tracks: Recorded) -> None:
     assert "focal length of cam1" in diagnosis.best_guess()
 
 
+@pytest.mark.slow
 def test_shutter_that_rolls() -> None:
     flight = sg.simulate(
         trajectory="random", duration_s=10, seed=3, shutter_readout_s=0.03, cameras=1
@@ -317,7 +326,7 @@ def jumping(part: Recorded, other: Recorded, between: tuple[int, int]) -> Record
     return rig, frames, ImuData(imu.stamps_ns, *samples)
 
 
-@pytest.mark.parametrize("look", [Diagnosis.of_tracks, Diagnosis.nearby])
+@pytest.mark.parametrize("look", [slow(Diagnosis.of_tracks), Diagnosis.nearby])
 def test_what_was_lost_does_not_count(
     stereo_tracks: Recorded, look: Callable[..., Diagnosis]
 ) -> None:
@@ -339,6 +348,7 @@ def test_what_was_lost_does_not_count(
     assert len(compared(jumped)) == 2
 
 
+@pytest.mark.slow
 def test_a_jump_that_nobody_noticed_does_not_turn_axes() -> None:
     """It spoils one of two windows, and wrong axes spoil every window."""
     flight = sg.simulate(trajectory="random", duration_s=16, seed=20)
@@ -431,6 +441,7 @@ def test_command_names_the_fault_and_its_exit_code_says_so(tmp_path: Path) -> No
     assert table["findings"][0]["kind"] == "time_offset"
 
 
+@pytest.mark.slow
 def test_real_images_have_no_faults(data_dir: Path) -> None:
     for name in ("euroc/V1_01_easy_static_2s", "euroc/MH_01_easy_17s"):
         diagnosis = Diagnosis.of(sg.open_dataset(data_dir / name))
@@ -439,6 +450,7 @@ def test_real_images_have_no_faults(data_dir: Path) -> None:
     assert {"camera_and_gyroscope", "stereo", "scale"} <= kinds
 
 
+@pytest.mark.slow
 def test_doubled_baseline_of_real_images(data_dir: Path) -> None:
     recording = sg.open_dataset(data_dir / "euroc/MH_01_easy_17s")
     one, two = recording.rig.cameras

@@ -167,6 +167,7 @@ def test_the_viewer_of_a_notebook_is_asked_for_by_name(
         result.show()
 
 
+@pytest.mark.slow
 def test_the_viewer_shows_a_result_inside_a_notebook(result: sg.RunResult, tmp_path: Path) -> None:
     """A cell that shows a saved result has the viewer as its output, and warns of nothing."""
     pytest.importorskip("rerun_notebook")

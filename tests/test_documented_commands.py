@@ -72,6 +72,7 @@ def test_names_of_commands_and_options_exist() -> None:
     assert not {line: fault for line, fault in faults.items() if fault}
 
 
+@pytest.mark.slow
 def test_the_example_of_the_readme_has_ten_lines_and_its_algorithms_agree(tmp_path: Path) -> None:
     """On the whole `demo`, in a process of its own."""
     ((_, _, example),) = blocks("README.md", "python")
@@ -112,6 +113,7 @@ def first_words(lines: list[str]) -> list[str]:
     return [line.split("  ")[0] for line in lines if line[:1].isalpha()]
 
 
+@pytest.mark.slow
 def test_demo_prints_what_is_shown(demo: list[str]) -> None:
     shown = next(blocks("docs/quickstart.md", "console"))[2].splitlines()
     assert shown[0] == "$ make demo"
@@ -120,6 +122,7 @@ def test_demo_prints_what_is_shown(demo: list[str]) -> None:
     assert shown[4] == demo[3], "how much was read"
 
 
+@pytest.mark.slow
 def test_a_truth_adds_the_tables_that_are_shown(tmp_path: Path) -> None:
     """Their rows and columns; the numbers are of the real recording."""
     printed_by("simulate", "flight", "--duration", "5", "--no-progress", cwd=tmp_path)

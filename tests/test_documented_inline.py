@@ -12,11 +12,15 @@ import pytest
 from documented import Step, inline_steps
 from documented_runs import STANDS_FOR, check_steps, in_place
 from documented_stock import Stock
+from groups import slow_but
 
 STEPS = inline_steps()
+LONG = ("slam-graph run", "slam-graph frontend")
+BRIEF = [s for s in STEPS if not s.text.startswith(LONG) or s.text == "slam-graph run DATA"]
+"""Those that `make test` runs: a run is much alike with other options."""
 
 
-@pytest.mark.parametrize("step", STEPS, ids=[step.text for step in STEPS])
+@pytest.mark.parametrize("step", slow_but(BRIEF, STEPS), ids=[step.text for step in STEPS])
 def test_it_works(
     step: Step, stock: Stock, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

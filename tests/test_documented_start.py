@@ -11,9 +11,12 @@ import pytest
 from documented import pages_of
 from documented_runs import check_page
 from documented_stock import Stock
+from groups import slow_but
 
 
-@pytest.mark.parametrize("page", pages_of("start"))
+@pytest.mark.parametrize(
+    "page", slow_but({"docs/quickstart.md", "docs/index.md", "docs/api.md"}, pages_of("start"))
+)
 def test_every_step_works(
     page: str, stock: Stock, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from flight import Flight, packets, rig, room
+from groups import slow, slow_but
 
 from slam_graph.arrays import FloatArray
 from slam_graph.backend import engine
@@ -204,7 +205,14 @@ CASES: dict[str, tuple[Change, str | None, int]] = {
 """What is changed, the warning that counts it, and how often it must at least be counted."""
 
 
-@pytest.mark.parametrize("name", CASES)
+BRIEF = {
+    *("nothing", "no right camera", "no left camera", "some features not finite", "ids mixed up"),
+    *("frames twice", "an old frame", "frames missing", "IMU not finite"),
+}
+"""Of the cases, those that `make test` runs."""
+
+
+@pytest.mark.parametrize("name", slow_but(BRIEF, CASES))
 def test_goes_on_and_finds_its_way_back(recording: list[Packet], name: str) -> None:
     change, warning, at_least = CASES[name]
     outcome = fly(change(recording))
@@ -217,7 +225,7 @@ def test_goes_on_and_finds_its_way_back(recording: list[Packet], name: str) -> N
     assert errors[-20:].max() < 0.052
 
 
-@pytest.mark.parametrize("length_s", [0.5, 1.0, 9.0])
+@pytest.mark.parametrize("length_s", [slow(0.5), slow(1.0), 9.0])
 def test_a_long_imu_gap_gives_finite_states(recording: list[Packet], length_s: float) -> None:
     outcome = fly(during(3.0, 3.0 + length_s, no_imu)(recording))
     assert len(outcome.states) == len(recording)

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from groups import slow, slow_but
 
 from slam_graph.config import algorithm_names, load_config
 from slam_graph.datasets.dataset_registry import open_dataset
@@ -33,7 +34,7 @@ def rmse(
 
 
 @pytest.mark.data
-@pytest.mark.parametrize("algorithm", ["msckf", "swf"])
+@pytest.mark.parametrize("algorithm", ["msckf", slow("swf")])
 def test_the_wheels_tracks(data_dir: Path, algorithm: str) -> None:
     """Monocular, at rest for five seconds, without being told the start state."""
     truth = data_dir / "euroc_inertial" / "V1_01_easy"
@@ -49,9 +50,9 @@ def test_the_wheels_tracks(data_dir: Path, algorithm: str) -> None:
 @pytest.mark.parametrize(
     ("algorithm", "cameras", "position_m", "angle_deg"),
     [
-        ("msckf", 1, 0.019, 0.21),
+        slow("msckf", 1, 0.019, 0.21),
         ("msckf", 2, 0.015, 0.19),
-        ("swf", 2, 0.015, 0.19),
+        slow("swf", 2, 0.015, 0.19),
     ],
 )
 def test_a_simulation_from_a_given_start(
@@ -84,7 +85,11 @@ def contract_runs() -> dict[str, RunResult]:
     return {}
 
 
-@pytest.fixture(params=algorithm_names())
+BRIEF = ("ekf", "fixed_lag_isam2", "msckf", "okvis", "swf")
+"""Algorithms that `make test` runs."""
+
+
+@pytest.fixture(params=slow_but(BRIEF, algorithm_names()))
 def contract_run(request: pytest.FixtureRequest, contract_runs: dict[str, RunResult]) -> RunResult:
     name = str(request.param)
     if name not in contract_runs:

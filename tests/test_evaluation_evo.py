@@ -10,6 +10,7 @@ from dataclasses import asdict
 from pathlib import Path
 
 import pytest
+from groups import slow
 
 from slam_graph.datasets.groundtruth import read_groundtruth
 from slam_graph.evaluation.absolute_pose_error import ape
@@ -68,7 +69,7 @@ def recording(data_dir: Path) -> Path:
 @pytest.mark.parametrize(
     ("metric", "options", "arguments", "peer"),
     [
-        (metric, *case, PEERS[index % len(PEERS)])
+        (slow if index % 3 else pytest.param)(metric, *case, PEERS[index % len(PEERS)])
         for metric, cases in (("ape", APE_CASES), ("rpe", RPE_CASES))
         for index, case in enumerate(cases)
     ],

@@ -18,6 +18,7 @@ import numpy as np
 import pytest
 from commands import slam_graph
 from documented_runs import do_tasks_here
+from groups import slow
 from limits import HANG_S
 from test_batch import command as batch
 from test_batch import flight, wait_for, worker_of
@@ -63,7 +64,8 @@ def simulated(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict]:
     return folder, json.loads(done.stdout)
 
 
-@pytest.mark.parametrize(("cameras", "alignment"), [(2, "se3"), (1, "sim3")])
+@pytest.mark.slow
+@pytest.mark.parametrize(("cameras", "alignment"), [(2, "se3"), slow(1, "sim3")])
 def test_without_an_imu_errors_are_aligned_in_what_nothing_measured(
     here: None, tmp_path: Path, cameras: int, alignment: str
 ) -> None:
@@ -205,6 +207,7 @@ def test_a_recording_of_tracks_with_its_truth(data_dir: Path, tmp_path: Path) ->
     assert all(row["status"] == {"ok": 1} and row["ate_m"]["yaw"] < 0.1 for row in rows)
 
 
+@pytest.mark.slow
 def test_an_interruption_keeps_what_is_done(tmp_path: Path) -> None:
     arguments = [
         "sim:figure8",
@@ -234,6 +237,7 @@ def test_an_interruption_keeps_what_is_done(tmp_path: Path) -> None:
     assert all((folder / "meta.yaml").is_file() for folder in kept), "something half done"
 
 
+@pytest.mark.slow
 def test_what_cannot_be_done_is_said_and_does_not_stop_the_rest(tmp_path: Path) -> None:
     sources = find_sources(["sim:figure8"], 1.0)
     broken = sources[0].model_copy(update={"simulation": None, "recording": "no_such_folder"})
@@ -340,6 +344,7 @@ def long_flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return flight(tmp_path_factory.mktemp("long") / "flight", 0, 60.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("by", [signal.SIGINT, signal.SIGKILL], ids=["ctrl_c", "killed"])
 def test_processes_that_workers_have_started_end_with_the_command(
     scheduler: str, long_flight: Path, tmp_path: Path, by: signal.Signals
@@ -417,6 +422,7 @@ def test_compare_from_python(here: None, tmp_path: Path) -> None:
     assert told == ["tracks of sim_figure8, seed 5", "swf on sim_figure8, seed 5"]
 
 
+@pytest.mark.slow
 def test_fixes_that_lie_elsewhere_are_compared_with(here: None, tmp_path: Path) -> None:
     """Named as a source they are recorded with the tracks; changed ones are recorded anew."""
     drive, fixes = tmp_path / "drive", tmp_path / "fixes.csv"

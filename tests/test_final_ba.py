@@ -194,6 +194,7 @@ def demo() -> RunResult:
     return run(open_dataset("demo"), load_config(overrides=["duration_s=9"]))
 
 
+@pytest.mark.slow
 @pytest.mark.data
 def test_it_is_better_than_the_causal_estimate_on_real_tracks(data_dir: Path) -> None:
     truth = data_dir / "euroc_inertial" / "V1_01_easy"

@@ -206,6 +206,7 @@ def settings(**given: object) -> dict[str, object]:
 ESTIMATED = {"lever_arm_sigma_m": 0.12, "time_offset_sigma_s": 0.05}
 
 
+@pytest.mark.slow
 def test_lever_arm_and_clock_are_found_as_well_as_they_say() -> None:
     """While the run goes on, and by the final adjustment; NEES over two flights."""
     causal, smoothed = [], []

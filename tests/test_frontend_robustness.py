@@ -105,6 +105,7 @@ def test_a_run_survives_dark_saturated_blurred_and_blank_images(folder: Path) ->
     assert np.min(counts[-10:]) > 80
 
 
+@pytest.mark.slow
 def test_random_matches_do_little_harm(
     folder: Path, clean_m: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -156,6 +157,7 @@ class MovingWall:
         return np.where((x > left) & (x < left + self.WIDTH_M), wall, image).astype(np.uint8)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("since_s", [0.0, 4.0])
 def test_a_moving_wall_does_little_harm(folder: Path, clean_m: float, since_s: float) -> None:
     """It neither spoils the start in motion nor, once the run has begun, the estimate."""
@@ -167,6 +169,7 @@ def test_a_moving_wall_does_little_harm(folder: Path, clean_m: float, since_s: f
     assert ate_m(result) < 1.65 * clean_m
 
 
+@pytest.mark.slow
 def test_a_process_for_the_front_end_changes_nothing(folder: Path) -> None:
     """Not even where the front end hears of the back end in every frame."""
     changes = [*CAUSAL, "frontend.prediction=state", "frontend.drop_rejected=true"]

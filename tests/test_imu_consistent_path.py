@@ -215,6 +215,7 @@ def test_what_cannot_be_joined_is_an_error() -> None:
         consistent_path(later, imu, flight.rig.imu)
 
 
+@pytest.mark.slow
 @pytest.mark.data
 def test_a_machine_hall_flight_has_no_jumps(data_dir: Path) -> None:
     """The truth of MH_04 jumps by up to 130 mm; the path that is flown does not."""

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from groups import slow
 
 from slam_graph.config import load_config
 from slam_graph.datasets import open_dataset
@@ -111,12 +112,15 @@ def error_m(*faults: str) -> float:
     return ape(truth, result.trajectory, alignment="se3").statistics.rmse
 
 
-@pytest.mark.parametrize("fault", ["imu_outlier", "gyro_outlier", "imu_saturated", "imu_zeros"])
+@pytest.mark.parametrize(
+    "fault", [slow("imu_outlier"), "gyro_outlier", slow("imu_saturated"), slow("imu_zeros")]
+)
 def test_a_run_survives_them(fault: str) -> None:
     """Its path is hardly worse than without the fault."""
     assert error_m(f"{fault}:at_s=12") < 2.0 * error_m()
 
 
+@pytest.mark.slow
 def test_one_camera_leads_over_a_gap_in_a_turn(data_dir: Path) -> None:
     """Nine tenths of a second without samples, of real tracks of one camera that turns."""
     truth = data_dir / "euroc_inertial/V1_01_easy"
@@ -132,7 +136,7 @@ def test_one_camera_leads_over_a_gap_in_a_turn(data_dir: Path) -> None:
     assert errors[1] < 2.0 * errors[0]
 
 
-@pytest.mark.parametrize("algorithm", ["msckf", "ekf", "fixed_lag_isam2"])
+@pytest.mark.parametrize("algorithm", ["msckf", slow("ekf"), slow("fixed_lag_isam2")])
 def test_a_velocity_that_no_image_tells_is_not_gone_on_with(data_dir: Path, algorithm: str) -> None:
     """One camera takes off while samples are missing, and no feature has a known depth."""
     truth = data_dir / "euroc_inertial/V1_01_easy"

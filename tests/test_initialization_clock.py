@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import yaml
 from flight import Flight, features, packets, rig, room
+from groups import slow
 from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
@@ -196,8 +197,8 @@ def errors_of(states: list[NavState]) -> FloatArray:
     return np.asarray(np.abs(lengths[0] - lengths[1]))
 
 
-@pytest.mark.parametrize("cameras", [1, 2])
-@pytest.mark.parametrize("offset_s", [-0.1, 0.055])
+@pytest.mark.parametrize("cameras", [slow(1), 2])
+@pytest.mark.parametrize("offset_s", [slow(-0.1), 0.055])
 def test_an_unknown_offset_is_found_in_the_start(offset_s: float, cameras: int) -> None:
     stream = recorded(offset_s, cameras, 6.0)
     estimator, states = estimate(stream, rig(cameras))
@@ -237,7 +238,7 @@ def test_features_that_are_known_to_move_do_not_bend_the_clock(known: bool) -> N
         assert abs(one.rig.cameras[0].time_offset_s + 0.05) < 0.01
 
 
-@pytest.mark.parametrize("name", ["msckf", "okvis"])
+@pytest.mark.parametrize("name", ["msckf", slow("okvis")])
 def test_a_calibration_that_fits_changes_nothing(name: str) -> None:
     stream = recorded(0.0, 1, 5.0)
     with_check, without = (estimate(stream, rig(), check, name) for check in (True, False))
@@ -287,6 +288,7 @@ def test_an_unknown_mounting_stands_in_the_file(tmp_path: Path) -> None:
     assert not read_kalibr(tmp_path / "phone.yaml").cameras[0].rotation_known
 
 
+@pytest.mark.slow
 def test_a_phone_with_nothing_but_a_focal_length_runs(tmp_path: Path) -> None:
     sequence = simulate(SimulationConfig(duration_s=14.0, rate_hz=20.0, flight=FlightConfig()))
     sequence.save(tmp_path / "flight")

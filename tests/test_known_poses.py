@@ -7,6 +7,7 @@ from pathlib import Path
 import gtsam
 import numpy as np
 import pytest
+from groups import slow
 from gtsam.symbol_shorthand import X
 from recordings import FRAME_PERIOD_NS, START_NS
 from recordings_ros import KINDS, LAG_NS, BagWriter, write_bag
@@ -216,7 +217,7 @@ def error_m(sequence: SimulatedSequence, result: RunResult) -> float:
 
 @pytest.mark.parametrize(
     ("algorithm", "imu"),
-    [("msckf", True), ("ekf", False), ("okvis", True), ("fixed_lag_isam2", False)],
+    [("msckf", True), slow("ekf", False), slow("okvis", True), slow("fixed_lag_isam2", False)],
 )
 def test_a_flight_ends_in_the_world_of_the_poses(algorithm: str, imu: bool) -> None:
     sequence = flight(0, imu)
@@ -226,6 +227,7 @@ def test_a_flight_ends_in_the_world_of_the_poses(algorithm: str, imu: bool) -> N
     assert error_m(sequence, result) < 0.04
 
 
+@pytest.mark.slow
 def test_positions_alone_and_orientations_alone() -> None:
     sequence = flight(1, True, rotation_sigma_rad=None)
     assert error_m(sequence, estimated(sequence)) < 0.06
@@ -244,6 +246,7 @@ def test_the_final_adjustment_is_in_the_world_of_the_poses() -> None:
     assert smoothed < 0.8 * error_m(sequence, result)
 
 
+@pytest.mark.slow
 def test_the_estimate_is_as_sure_as_it_should_be() -> None:
     """NEES of orientation and position over eight flights, at times that are far apart."""
     found: list[FloatArray] = []

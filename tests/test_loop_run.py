@@ -46,6 +46,7 @@ def results(flight: Path, output: Path, *options: str) -> tuple[Path, dict]:
     return Path(table["folder"]), table
 
 
+@pytest.mark.slow
 def test_loops_are_closed_if_asked_for(flight: Path, tmp_path: Path) -> None:
     folder, table = results(flight, tmp_path / "with", "--loop-closure", *SETTINGS)
     loops = table["loop_closure"]
@@ -68,6 +69,7 @@ def test_loops_are_closed_if_asked_for(flight: Path, tmp_path: Path) -> None:
     assert (without / "trajectory.tum").read_text() == (folder / "trajectory.tum").read_text()
 
 
+@pytest.mark.slow
 def test_a_result_of_all_stages_reads_back_as_it_was(flight: Path, tmp_path: Path) -> None:
     overrides = {"loop_closure.enabled": True, "loop_closure.places.words": 300}
     result = run(flight, overrides={**overrides, "map.enabled": True})

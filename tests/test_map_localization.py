@@ -7,6 +7,7 @@ from dataclasses import replace
 import gtsam
 import numpy as np
 import pytest
+from groups import slow
 from map_flights import World
 
 from slam_graph.errors import DataError
@@ -29,7 +30,7 @@ def noisy(pose: gtsam.Pose3, sigmas: np.ndarray, rng: np.random.Generator) -> gt
     return pose.compose(gtsam.Pose3(gtsam.Rot3.Expmap(turn), shift))
 
 
-@pytest.mark.parametrize("level", [True, False])
+@pytest.mark.parametrize("level", [True, slow(False)])
 def test_the_filter_is_as_wrong_as_it_says(level: bool) -> None:
     """NEES over many flights with odometry that drifts and matchs that are off as they say."""
     config = CONFIG.model_copy(update={"map_rotation_sigma": 1e-6, "map_position_sigma": 1e-6})

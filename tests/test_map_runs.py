@@ -74,6 +74,7 @@ def test_the_second_half_is_located_in_the_map_of_the_first(second: Path) -> Non
         assert ate["rotation_deg"]["max"] < WITHIN_DEG
 
 
+@pytest.mark.slow
 def test_maps_of_both_halves_become_one(tour: Path, known: Path, second: Path) -> None:
     merged = tour / "merged.slam"
     arguments = ("map", "merge", known, second, "--output", merged)
@@ -123,6 +124,7 @@ def test_maps_are_not_optimised(tour: Path, known: Path) -> None:
     assert not (tour / "optimised").exists()
 
 
+@pytest.mark.slow
 def test_strangers_are_refused(tour: Path, known: Path) -> None:
     rooms(seed=2, duration_s=6.0).save(tour / "elsewhere")
     result = run(rooms(seed=2, duration_s=20.0), load_config(None, ["map.enabled=true"]))
@@ -156,6 +158,7 @@ def test_what_has_no_descriptors_is_refused_before_the_first_frame(
     assert not any((tmp_path / "out").rglob("*.tum"))
 
 
+@pytest.mark.slow
 def test_two_flights_through_one_place_by_the_recipe(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

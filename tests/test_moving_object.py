@@ -175,6 +175,7 @@ def started_s(result: RunResult) -> float:
     return float(result.trajectory.stamps_ns[0] - result.input.start_ns) * 1e-9
 
 
+@pytest.mark.slow
 def test_an_object_through_a_third_of_the_view_does_little_harm(calibration: Path) -> None:
     """There from the first frame on, before a stereo camera that begins in motion.
 

@@ -9,6 +9,7 @@ from typing import Any
 import gtsam
 import numpy as np
 import pytest
+from groups import slow
 
 from slam_graph import run
 from slam_graph.evaluation import ape
@@ -42,7 +43,7 @@ def beside_an_object(objects: bool, **settings: Any) -> RunResult:
     )
 
 
-@pytest.mark.parametrize("seed", [0, 1, 3])
+@pytest.mark.parametrize("seed", [0, slow(1), slow(3)])
 def test_an_object_does_not_pull_two_cameras_without_an_imu(seed: int) -> None:
     result = beside_an_object(objects=False, cameras=2, with_imu=False, seed=seed)
     assert result.status == "ok"
@@ -52,6 +53,7 @@ def test_an_object_does_not_pull_two_cameras_without_an_imu(seed: int) -> None:
     assert error.statistics.rmse < 0.15
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("with_imu", [True, False])
 def test_objects_before_a_depth_camera(with_imu: bool) -> None:
     result = beside_an_object(objects=True, with_imu=with_imu, seed=2, **DEPTH)

@@ -8,10 +8,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from groups import slow_but
 from limits import HANG_S
 
 ROOT = Path(__file__).parent.parent
 NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
+QUICK = [path for path in NOTEBOOKS if path.name[:2] in ("01", "04")]
+"""Executed by `make test`: first steps; start and IMU."""
 LARGEST_BYTES = 250_000
 PICTURE = re.compile(r'"image/png"|data:image/png;base64')
 MACHINE = re.compile(r"/(home|root|tmp|work|usr|opt|Users)/|site-packages|[A-Z]:\\\\")
@@ -72,7 +75,7 @@ def test_links_and_names_of_files_are_of_something(path: Path) -> None:
         assert (ROOT / file).is_file(), file
 
 
-@pytest.mark.parametrize("path", NOTEBOOKS, ids=name)
+@pytest.mark.parametrize("path", slow_but(QUICK, NOTEBOOKS), ids=name)
 def test_notebook_runs(path: Path, tmp_path: Path) -> None:
     nbclient = pytest.importorskip("nbclient")
     nbformat = pytest.importorskip("nbformat")

@@ -142,6 +142,7 @@ def estimated(sequence: SimulatedSequence, **changes: Any) -> RunResult:
     return run(sequence, overrides={**always, **changes})
 
 
+@pytest.mark.slow
 def test_masks_keep_three_objects_apart() -> None:
     objects = {"count": 3, "motion": "mixed", "masks": True}
     sequence = simulate(
@@ -201,6 +202,7 @@ def run_with_masks(recording: Path, masks: Path, output: Path) -> dict[str, Any]
     return metrics
 
 
+@pytest.mark.slow
 def test_a_parked_car_is_no_moving_object(
     still_world: tuple[Path, list[int]], tmp_path: Path
 ) -> None:

@@ -90,6 +90,7 @@ def two() -> RunResult:
     return flight_of_two(3)
 
 
+@pytest.mark.slow
 def test_smoothed_objects_are_better_than_those_on_the_way(two: RunResult) -> None:
     table = two.metrics["moving_objects"]
     smoothed, causal = table["smoothed"], table["accuracy"]

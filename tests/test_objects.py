@@ -319,6 +319,7 @@ def test_the_platform_does_not_suffer(turning: RunResult) -> None:
     assert error(turning) < 1.5 * error(alone) + 0.002
 
 
+@pytest.mark.slow
 def test_an_object_that_stops_is_known_to_stand() -> None:
     sequence = flight(count=1, motion="stop_and_go")
     result = estimated(sequence)
@@ -373,6 +374,7 @@ def test_the_window_of_the_platform_forgets_the_first_pose() -> None:
     assert np.all(np.linalg.eigvalsh(last.velocity_covariance) > 0)
 
 
+@pytest.mark.slow
 def test_images_of_a_rendered_object_show_its_motion() -> None:
     sequence = simulate(
         kind="images", duration_s=3.0, rate_hz=RATE_HZ, objects={"count": 1, "masks": True}

@@ -11,6 +11,7 @@ from typing import Any
 import gtsam
 import numpy as np
 import pytest
+from groups import slow_but
 from gtsam.symbol_shorthand import B, L, V, X
 
 from slam_graph import run
@@ -23,6 +24,7 @@ from slam_graph.backend.initialization.two_views import TwoViews, two_view_motio
 from slam_graph.backend.policies import AlgorithmConfig
 from slam_graph.backend.solve.square_root import Layout
 from slam_graph.backend.solve.state import dims_of
+from slam_graph.config import algorithm_names
 from slam_graph.errors import DataError
 from slam_graph.evaluation import ape
 from slam_graph.geometry import Similarity, Trajectory
@@ -251,10 +253,7 @@ def test_turning_on_the_spot_after_the_start_does_not_destroy_the_map() -> None:
 # --- whole runs ---------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    "algorithm",
-    ["msckf", "swf", "okvis", "ekf", "iekf", "fixed_lag_isam2", "fixed_lag_batch", "isam2"],
-)
+@pytest.mark.parametrize("algorithm", slow_but({"msckf"}, algorithm_names()))
 def test_every_algorithm_runs_on_one_camera(algorithm: str) -> None:
     settings = ["final_ba.enabled=false", OWN_START]
     result = run(simulated(), algorithm=algorithm, overrides=settings)
@@ -293,6 +292,7 @@ def test_a_map_in_metres_is_refused() -> None:
         run(simulated(duration_s=2.0), algorithm="msckf", overrides=["map.enabled=true"])
 
 
+@pytest.mark.slow
 def test_a_real_camera_alone(data_dir: Path) -> None:
     result = run(
         data_dir / "euroc" / "MH_01_easy_17s",

@@ -18,6 +18,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from groups import slow
 
 from slam_graph.config import load_config
 from slam_graph.datasets.formats.euroc import EurocSequence
@@ -187,7 +188,7 @@ result.check()
 
 @pytest.mark.parametrize(
     ("number", "to_all"),
-    [(signal.SIGINT, True), (signal.SIGTERM, True), (signal.SIGKILL, False)],
+    [(signal.SIGINT, True), slow(signal.SIGTERM, True), slow(signal.SIGKILL, False)],
 )
 def test_no_process_is_left(flight: Path, number: signal.Signals, to_all: bool) -> None:
     """After a signal to the whole group, as from a terminal, or to the back end alone."""

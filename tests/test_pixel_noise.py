@@ -5,6 +5,7 @@
 import numpy as np
 import pytest
 from flight import Flight, rig, room, scene
+from groups import slow
 
 from slam_graph.arrays import FloatArray
 from slam_graph.backend import engine_protocol
@@ -183,7 +184,9 @@ class Recorded(PixelNoise):
         Recorded.last = self
 
 
-@pytest.mark.parametrize(("name", "sigma_px"), [("msckf", 0.5), ("msckf", 1.0), ("swf", 2.0)])
+@pytest.mark.parametrize(
+    ("name", "sigma_px"), [slow("msckf", 0.5), ("msckf", 1.0), slow("swf", 2.0)]
+)
 def test_a_flight_finds_its_noise_and_knows_its_errors(
     name: str, sigma_px: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:

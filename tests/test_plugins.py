@@ -229,6 +229,7 @@ def test_a_plugin_brings_a_format_and_a_front_end(
     assert np.all(rows["id"] % 2 == 0)
 
 
+@pytest.mark.slow
 def test_a_plugin_brings_a_pose_selection(environment: dict[str, str], tmp_path: Path) -> None:
     options = ("--duration", "12", "--set", "algorithm.cost.past_poses=second_newest_leaves")
     done = slam_graph(environment, tmp_path, "run", "demo", "--output", "out", *options)

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 from flight import rig
+from groups import slow_but
 from gtsam.symbol_shorthand import B, V, X
 from scipy.linalg import eigvalsh
 from test_policy_product import LOOSE, TOLERANCE, Batch, accepted
@@ -138,8 +139,8 @@ def sample(past_poses: str, features: str) -> Iterator[AlgorithmConfig]:
     yield from (every[k] for k in chosen)
 
 
-@pytest.mark.parametrize("features", list(FEATURE_POLICIES))
-@pytest.mark.parametrize("past_poses", list(POSE_SELECTIONS))
+@pytest.mark.parametrize("features", slow_but({"state", "once"}, FEATURE_POLICIES))
+@pytest.mark.parametrize("past_poses", slow_but({"most_recent", "keyframes"}, POSE_SELECTIONS))
 def test_what_is_rejected_does_not_come_back(
     past_poses: str,
     features: str,

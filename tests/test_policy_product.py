@@ -16,6 +16,7 @@ import gtsam
 import numpy as np
 import pytest
 from flight import rig, room
+from groups import slow_but
 from gtsam.symbol_shorthand import B, V, X
 from linear_flight import CONFIG, batch_problem, exact_recording
 from scipy.linalg import eigvalsh, solve_triangular
@@ -168,8 +169,13 @@ def batches() -> list[tuple[Rig, Batch]]:
     return [(mounted, Batch(mounted)) for mounted in (rig(1), rig(2))]
 
 
-@pytest.mark.parametrize("features", [*FEATURE_POLICIES, FROM_OUTSIDE[1]])
-@pytest.mark.parametrize("past_poses", [*POSE_SELECTIONS, FROM_OUTSIDE[0]])
+@pytest.mark.parametrize(
+    "features", slow_but({"state", FROM_OUTSIDE[1]}, [*FEATURE_POLICIES, FROM_OUTSIDE[1]])
+)
+@pytest.mark.parametrize(
+    "past_poses",
+    slow_but({"most_recent", "keyframes", FROM_OUTSIDE[0]}, [*POSE_SELECTIONS, FROM_OUTSIDE[0]]),
+)
 def test_no_measurement_counts_twice(
     past_poses: str, features: str, batches: list[tuple[Rig, Batch]]
 ) -> None:

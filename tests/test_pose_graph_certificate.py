@@ -38,6 +38,7 @@ def test_the_optima_of_sesync_are_found_and_certified(data_dir: Path, name: str)
     assert found.bound <= found.objective * (1 + 1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.data
 def test_a_flat_valley_is_followed_to_its_end(data_dir: Path) -> None:
     """The Hessian of ais2klinik has entries that differ by many orders of magnitude."""
@@ -48,6 +49,7 @@ def test_a_flat_valley_is_followed_to_its_end(data_dir: Path) -> None:
     assert found.objective == pytest.approx(188.5018, abs=1e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.data
 def test_the_optimum_of_a_repaired_graph_is_that_of_sesync(data_dir: Path) -> None:
     path, diagnostics = data_dir / "posegraphs" / "cubicle.g2o", Diagnostics()

@@ -8,6 +8,7 @@ import gtsam
 import numpy as np
 import pytest
 from flight import Flight
+from groups import slow
 from gtsam.symbol_shorthand import L, V, X
 from scipy.spatial.transform import Rotation
 
@@ -306,7 +307,7 @@ def error_m(result: RunResult, sequence: SimulatedSequence, since: float = 0.5) 
     return ape(sequence.groundtruth(), late, alignment="none").statistics.rmse
 
 
-@pytest.mark.parametrize("algorithm", ["msckf", "ekf", "okvis"])
+@pytest.mark.parametrize("algorithm", ["msckf", slow("ekf"), slow("okvis")])
 def test_a_drive_ends_in_the_world_of_the_fixes(algorithm: str) -> None:
     """From a start of its own, with every fifth fix off by 10 m."""
     sequence = drive(60.0, gnss={"sigma_m": 1.0, "multipath": 0.2})
@@ -319,7 +320,7 @@ def test_a_drive_ends_in_the_world_of_the_fixes(algorithm: str) -> None:
     assert error_m(result, sequence) < 1.5
 
 
-@pytest.mark.parametrize(("given", "sigma"), [(-0.3, 0.0), (0.0, 0.3)])
+@pytest.mark.parametrize(("given", "sigma"), [slow(-0.3, 0.0), (0.0, 0.3)])
 def test_fixes_that_come_late_count_where_they_were_measured(given: float, sigma: float) -> None:
     """By an offset that is given, or found; neglected, it is 3 m on the road."""
     sequence = drive(30.0, rate_hz=10.0, gnss={"sigma_m": 0.3, "rate_hz": 2.0, "late_s": 0.3})
@@ -330,6 +331,7 @@ def test_fixes_that_come_late_count_where_they_were_measured(given: float, sigma
     assert error_m(result, sequence) < 0.6
 
 
+@pytest.mark.slow
 def test_fixes_bound_the_error_of_odometry_that_drifts() -> None:
     """With few poor features the path drifts by metres; fixes hold it."""
     poor = {"features": 20, "pixel_sigma": 2.0}
@@ -367,6 +369,7 @@ def test_odometry_helps_where_few_features_are_seen() -> None:
         sequence = simulate(
             trajectory="car",
             duration_s=20.0,
+            rate_hz=10.0,
             seed=3,
             with_imu=False,
             tracks=poor,
@@ -377,6 +380,7 @@ def test_odometry_helps_where_few_features_are_seen() -> None:
     assert errors[1] < 0.8 * errors[0]
 
 
+@pytest.mark.slow
 def test_the_final_adjustment_is_in_the_world_of_the_fixes() -> None:
     sequence = drive(60.0, gnss={"sigma_m": 1.0, "multipath": 0.2})
     result = run(sequence, algorithm="msckf")

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from groups import slow
 
 import slam_graph as sg
 from slam_graph.config import algorithm_names
@@ -101,7 +102,7 @@ def test_a_file_of_an_algorithm_is_a_configuration_too(tmp_path: Path) -> None:
     assert sg.load_config(str(path)).algorithm.name == "mine"
 
 
-@pytest.mark.parametrize("page", ["configuration.md", "results.md"])
+@pytest.mark.parametrize("page", ["configuration.md", slow("results.md")])
 def test_the_python_of_the_documents_runs(
     page: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -11,6 +11,7 @@ from functools import cache
 from pathlib import Path
 
 import pytest
+from groups import slow
 from limits import HANG_S
 from pydantic import BaseModel
 
@@ -76,7 +77,7 @@ def test_settings_exist() -> None:
     assert not sorted(setting for setting in settings if not exists(setting))
 
 
-@pytest.mark.parametrize("page", ["questions.md", "extending.md"])
+@pytest.mark.parametrize("page", ["questions.md", slow("extending.md")])
 def test_the_pose_selection_of_the_page_runs(page: str) -> None:
     """In a process of its own, as a name that is registered stays."""
     text = (ROOT / "docs" / page).read_text(encoding="utf-8")

@@ -205,6 +205,7 @@ def assert_same_objects(one: RunResult, other: RunResult) -> None:
             assert a.world_T_object.equals(b.world_T_object, 1e-3)
 
 
+@pytest.mark.slow
 def test_a_recording_of_two_boxes_with_labels_is_run_like_the_simulation(tmp_path: Path) -> None:
     objects = {"count": 2, "motion": "mixed", "masks": True}
     sequence = simulate(
@@ -236,6 +237,7 @@ def test_masks_that_are_named_take_the_place_of_labels(recorded: Path) -> None:
     assert named.mask_classes == {}
 
 
+@pytest.mark.slow
 def test_a_run_on_images_with_masks_is_recorded_with_labels(tmp_path: Path) -> None:
     sequence = simulate(
         kind="images", duration_s=3.0, rate_hz=10.0, objects={"count": 1, "masks": True}

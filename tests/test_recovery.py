@@ -10,6 +10,7 @@ from pathlib import Path
 import gtsam
 import numpy as np
 import pytest
+from groups import slow
 from gtsam.symbol_shorthand import L, X
 
 from slam_graph.backend.cost.gating import Innovations
@@ -104,14 +105,17 @@ def test_time_between_segments_is_not_covered(blind: RunResult, tmp_path: Path) 
     assert sum(int(row["states"]) for row in rows) == len(stamps)
 
 
-@pytest.mark.parametrize("fault", ["imu_missing:at_s=6,duration_s=1.5", "frames_dropped:at_s=6"])
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "fault", [slow("imu_missing:at_s=6,duration_s=1.5"), "frames_dropped:at_s=6"]
+)
 def test_one_sensor_alone_goes_on_without_the_other(fault: str) -> None:
     result = flown(fault)
     assert result.status == "ok"
     assert len(result.segments) == 1
 
 
-@pytest.mark.parametrize("algorithm", ["msckf", "swf", "okvis"])
+@pytest.mark.parametrize("algorithm", ["msckf", slow("swf"), slow("okvis")])
 def test_being_carried_away_is_noticed_whatever_is_in_the_cost(algorithm: str) -> None:
     result = flown("kidnapped:at_s=6,duration_s=2", algorithm=algorithm)
     assert [segment.joined_by for segment in result.segments] == ["start", "none"]
@@ -127,7 +131,9 @@ def test_a_jump_to_where_everything_fits_is_noticed_by_the_tracks_across_it() ->
     assert max(error_m(result, 0), error_m(result, 1)) < 0.02
 
 
-@pytest.mark.parametrize("algorithm", ["msckf", "okvis", "ekf", "fixed_lag_isam2"])
+@pytest.mark.parametrize(
+    "algorithm", ["msckf", slow("okvis"), slow("ekf"), slow("fixed_lag_isam2")]
+)
 def test_images_lead_through_a_time_without_imu(algorithm: str) -> None:
     """What is known of biases stays known, so that no new start is needed."""
     result = flown("imu_missing:at_s=6,duration_s=3", algorithm=algorithm)
@@ -160,7 +166,7 @@ def test_a_correction_is_as_large_as_expected() -> None:
     assert np.mean(squares) == pytest.approx(found.expected, rel=0.1)
 
 
-@pytest.mark.parametrize("algorithm", ["okvis", "fixed_lag_isam2"])
+@pytest.mark.parametrize("algorithm", ["okvis", slow("fixed_lag_isam2")])
 def test_another_velocity_is_not_taken_over(algorithm: str) -> None:
     """No track goes on across the jump: new features agree with the new velocity, the IMU not."""
     result = flown("kidnapped:at_s=6,duration_s=3.7", algorithm=algorithm)
@@ -205,7 +211,7 @@ def test_a_single_correction_after_a_pause_is_no_contradiction() -> None:
     assert corrections.agreed_until() is None
 
 
-@pytest.mark.parametrize("algorithm", ["swf", "okvis", "fixed_lag_isam2"])
+@pytest.mark.parametrize("algorithm", ["swf", slow("okvis"), slow("fixed_lag_isam2")])
 def test_every_engine_starts_again(algorithm: str) -> None:
     result = flown("all_missing:at_s=6,duration_s=2", algorithm=algorithm)
     assert result.status == "ok"

@@ -10,6 +10,8 @@ from slam_graph.evaluation import ape
 from slam_graph.simulation import simulate
 from slam_graph.simulation.simulated_sequence import SimulatedSequence
 
+pytestmark = pytest.mark.slow
+
 CAUSAL = {"final_ba.enabled": False}
 LOST = "frames_dropped:at_s={},duration_s=3"
 

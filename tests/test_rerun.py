@@ -11,6 +11,7 @@ import gtsam
 import numpy as np
 import pytest
 from flight import rig
+from groups import slow
 from map_flights import World
 from pose_graphs import laps
 from rerun.chunk import RrdReader
@@ -187,6 +188,7 @@ def test_the_recording_of_a_run_adds_its_inputs(tmp_path: Path) -> None:
     assert found.rows["/imu/gyro"] == found.rows["/imu/accel"] == samples
 
 
+@pytest.mark.slow
 def test_every_run_is_judged_by_its_own_truth(tmp_path: Path) -> None:
     """Two flights through one place, of the same algorithm: errors are those of their metrics."""
     for seed, day in enumerate(("monday", "tuesday"), start=1):
@@ -248,7 +250,7 @@ def viewed(tmp_path: Path, *what: Path | str) -> Content:
     return content(path)
 
 
-@pytest.mark.parametrize(("images", "frames"), [("none", 0), ("keyframes", 3), ("all", 13)])
+@pytest.mark.parametrize(("images", "frames"), [slow("none", 0), ("keyframes", 3), slow("all", 13)])
 def test_images_are_sent_of_the_frames_that_are_asked_for(
     images: str, frames: int, tmp_path: Path
 ) -> None:

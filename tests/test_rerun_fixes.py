@@ -65,6 +65,7 @@ def shown(rows: Mapping[str, list[Row]]) -> tuple[FloatArray, list[tuple[int, in
     return places, [colour(packed) for row in rows[entity] for packed in row["colors"]]
 
 
+@pytest.mark.slow
 def test_all_fixes_are_in_the_world_of_the_fixes(
     watched: tuple[RunResult, Mapping[str, list[Row]]],
 ) -> None:
@@ -82,6 +83,7 @@ def test_all_fixes_are_in_the_world_of_the_fixes(
     assert np.median(np.linalg.norm(places[begun:, None] - path, axis=2).min(axis=1)) < 2.0
 
 
+@pytest.mark.slow
 def test_fixes_that_the_gate_rejects_are_red(
     watched: tuple[RunResult, Mapping[str, list[Row]]],
 ) -> None:
@@ -102,6 +104,7 @@ def test_fixes_that_the_gate_rejects_are_red(
     assert error[later].min() > 5.0 > np.median(error[~later])
 
 
+@pytest.mark.slow
 def test_without_use_of_the_fixes_none_are_shown(tmp_path: Path) -> None:
     viewer = RerunRecording("save", "unused", tmp_path / "unused.rrd").viewer()
     off = {"backend.gnss.enabled": False, "final_ba.enabled": False}
@@ -110,6 +113,7 @@ def test_without_use_of_the_fixes_none_are_shown(tmp_path: Path) -> None:
     assert not any(FIXES in name.split("/") for name in rows_of(tmp_path / "unused.rrd"))
 
 
+@pytest.mark.slow
 def test_a_saved_run_shows_the_fixes_of_its_recording(
     watched: tuple[RunResult, Mapping[str, list[Row]]], tmp_path: Path
 ) -> None:
@@ -166,6 +170,7 @@ def test_known_poses_of_a_run_are_shown_in_their_world(tmp_path: Path) -> None:
     assert not any(name.endswith(f"/{FIXES}") for name in rows)
 
 
+@pytest.mark.slow
 def test_a_saved_run_shows_only_what_it_used(tmp_path: Path) -> None:
     """Like the run that is watched: no fixes where they are not used."""
     flight = sg.simulate(

@@ -10,6 +10,7 @@ import gtsam
 import numpy as np
 import pytest
 from flight import FISHEYE, RADTAN, Flight, features, rig, room
+from groups import slow
 from gtsam.symbol_shorthand import L, X
 from recordings import edit_text
 from test_backend_reprojection import native_factor
@@ -291,13 +292,13 @@ def stepped(name: str, cameras: int = 1, frames: int = 30) -> Estimator:
     return estimator
 
 
-@pytest.mark.parametrize("name", ["msckf", "okvis", "ekf"])
-@pytest.mark.parametrize("cameras", [1, 2])
+@pytest.mark.parametrize("name", ["msckf", slow("okvis"), "ekf"])
+@pytest.mark.parametrize("cameras", [1, slow(2)])
 def test_the_window_as_a_factor_graph_has_the_rows(name: str, cameras: int) -> None:
     check(stepped(name, cameras))
 
 
-@pytest.mark.parametrize("name", ["msckf", "okvis", "fixed_lag_isam2"])
+@pytest.mark.parametrize("name", ["msckf", slow("okvis"), slow("fixed_lag_isam2")])
 def test_estimates_know_the_rows(name: str) -> None:
     errors = []
     for known in (True, False):

@@ -8,6 +8,7 @@ from pathlib import Path
 import gtsam
 import numpy as np
 import pytest
+from groups import slow
 from scipy.spatial.transform import Rotation
 
 from slam_graph.arrays import FloatArray
@@ -48,7 +49,7 @@ def sigmas_away(fit: RotationFit, body_R_camera: FloatArray) -> float:
     return float(np.sqrt(turn @ np.linalg.solve(covariance, turn)))
 
 
-@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize("seed", [slow(0), 1])
 def test_noise_of_tracks_is_no_fault(seed: int) -> None:
     """Weighted squares alone would say: a focal length that is wrong by 2 to 3 %."""
     rig, part = recorded("random", seed, pixel_sigma=2.0)
@@ -58,6 +59,7 @@ def test_noise_of_tracks_is_no_fault(seed: int) -> None:
     assert fit.noise_px == pytest.approx(2.0, rel=0.15)
 
 
+@pytest.mark.slow
 def test_noise_of_tracks_is_no_fault_on_a_slow_flight(data_dir: Path) -> None:
     rig, part = recorded(str(data_dir / "euroc_inertial/V2_01_easy"), 0, pixel_sigma=1.0)
     fit = fitted(rig, part)
@@ -65,7 +67,7 @@ def test_noise_of_tracks_is_no_fault_on_a_slow_flight(data_dir: Path) -> None:
     assert sigmas_away(fit, rig.cameras[0].body_T_camera.rotation().matrix()) < 5.0
 
 
-@pytest.mark.parametrize("axis", [0, 1, 2])
+@pytest.mark.parametrize("axis", [slow(0), 1, 2])
 def test_a_camera_that_is_turned_by_three_degrees_is_named(axis: int) -> None:
     """In its own frame, and by as much as it is turned."""
     rig, part = recorded("figure8", 0, pixel_sigma=1.0)

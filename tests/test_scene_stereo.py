@@ -135,6 +135,7 @@ def pairs(images: list[Exported]) -> list[tuple[Exported, Exported]]:
     return [(image, at[1, name]) for (camera, name), image in at.items() if camera == 0]
 
 
+@pytest.mark.slow
 def test_points_project_to_where_both_cameras_have_seen_them(scene: Path) -> None:
     model = scene / "sparse" / "0"
     points = {int(row[0]): np.array(row[1:4], float) for row in rows(model / "points3D.txt")}
@@ -152,6 +153,7 @@ def test_points_project_to_where_both_cameras_have_seen_them(scene: Path) -> Non
         assert np.median(np.concatenate(errors)) < 0.5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("file", ["sparse/0", "transforms.json"])
 def test_matches_that_opencv_finds_lie_on_the_epipolar_lines(scene: Path, file: str) -> None:
     """And depths by triangulation are positive: the baseline has the right sign."""

@@ -77,12 +77,14 @@ def task(root: Path) -> RecordTask:
     return RecordTask(source=source, seed=0, config=load_config(), root=root)
 
 
+@pytest.mark.slow
 def test_a_task_is_done_by_tls(scheduler: str, files: dict[str, Path], tmp_path: Path) -> None:
     wanted = task(tmp_path)
     assert list(executor_for(None, scheduler, files).do([wanted])) == [(wanted, None)]
     assert wanted.is_done()
 
 
+@pytest.mark.slow
 def test_without_the_files_there_is_no_connection(scheduler: str, tmp_path: Path) -> None:
     with pytest.raises(DataError, match="no Dask scheduler answers at 'tls://"):
         next(DaskCluster(scheduler).do([task(tmp_path)]))

@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from groups import slow
 
 from slam_graph.backend import FinalBa
 from slam_graph.config import load_config
@@ -216,7 +217,7 @@ def workers(pid: int) -> list[int]:
 
 
 @pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="needs Linux' /proc")
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
+@pytest.mark.parametrize("number", [slow(signal.SIGTERM), signal.SIGKILL])
 def test_compare_leaves_no_worker_behind(tmp_path: Path, number: signal.Signals) -> None:
     arguments = ("sim:figure8", "--duration", "60", "--workers", "1", "--output", tmp_path / "out")
     process = start("compare", *arguments, folder=tmp_path)
@@ -262,8 +263,8 @@ def test_damaged_results_are_done_again(tmp_path: Path) -> None:
         assert task.is_done()
 
 
-@pytest.mark.parametrize("ignored", [False, True], ids=["foreground", "background"])
-@pytest.mark.parametrize("by", ["pipe", "stop"])
+@pytest.mark.parametrize("ignored", [False, slow(True)], ids=["foreground", "background"])
+@pytest.mark.parametrize("by", ["pipe", slow("stop")])
 def test_a_task_ends_with_the_one_who_waits_for_it(tmp_path: Path, ignored: bool, by: str) -> None:
     """When that one is gone, or stops it; also where a shell lets Ctrl-C be ignored."""
     source = find_sources(["sim:figure8"], 600.0)[0]

@@ -204,7 +204,7 @@ def test_the_start_is_the_truth_or_in_error_as_its_covariance_says() -> None:
 
 
 def test_a_frame_ends_every_period() -> None:
-    sequence = tracks(trajectory="rooms", duration_s=100.0, tracks={"features": 5})
+    sequence = tracks(trajectory="rooms", duration_s=100.0, cameras=1, tracks={"features": 5})
     assert sum(1 for _ in sequence.packets()) == 2001
 
 

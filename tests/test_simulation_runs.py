@@ -146,10 +146,12 @@ def ate(sequence: SimulatedSequence) -> float:
     return rmse
 
 
+@pytest.mark.slow
 def test_the_estimator_follows_a_simulated_flight() -> None:
     assert ate(simulated(duration_s=15.0)) < 0.0115
 
 
+@pytest.mark.slow
 @pytest.mark.data
 def test_the_estimator_follows_a_real_flight_with_its_real_imu(data_dir: Path) -> None:
     path = data_dir / "euroc_inertial" / "V2_01_easy"

@@ -29,6 +29,9 @@ FETCHED = re.compile(
 """What a browser loads from elsewhere when a page is opened. Links are not."""
 
 
+pytestmark = pytest.mark.slow
+
+
 @pytest.fixture(scope="module")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for package in ("material", "mkdocstrings", "math_core", "mermaidx", "nbconvert"):

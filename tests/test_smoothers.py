@@ -9,6 +9,7 @@ import gtsam
 import numpy as np
 import pytest
 from flight import FISHEYE, RADTAN, Flight, rig, room, scene
+from groups import slow_but
 from gtsam.symbol_shorthand import B, L, V, X
 
 from slam_graph.backend.backend_config import BackendConfig
@@ -75,8 +76,9 @@ def test_a_smoother_gives_back_its_prior(name: str) -> None:
     assert solver.estimate(keys).atPose3(X(0)).equals(turned, 1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.data
-@pytest.mark.parametrize("name", SOLVERS)
+@pytest.mark.parametrize("name", slow_but({"fixed_lag_isam2"}, SOLVERS))
 def test_the_wheels_tracks(data_dir: Path, name: str) -> None:
     """From rest through the take-off into the flight, without being told the start state."""
     truth = data_dir / "euroc_inertial" / "V1_01_easy"

@@ -115,6 +115,7 @@ def test_the_run_goes_on_from_the_new_solution(monkeypatch: pytest.MonkeyPatch) 
     assert np.max(history.sigmas()[:, 6:9]) < 0.1
 
 
+@pytest.mark.slow
 def test_so_it_does_where_frames_wait_for_the_imu(monkeypatch: pytest.MonkeyPatch) -> None:
     """With a time offset that the start has found, a frame may lead to several states or none."""
     monkeypatch.setattr(start_review, "contradict", lambda *_: True)
@@ -129,6 +130,7 @@ def test_so_it_does_where_frames_wait_for_the_imu(monkeypatch: pytest.MonkeyPatc
     assert error.statistics.rmse < 0.05
 
 
+@pytest.mark.slow
 def test_a_start_without_a_metre_scale_is_a_choice() -> None:
     """It comes earlier, says that the scale is not known, and the scale is right in the end."""
     sequence = simulate(trajectory="random", duration_s=16.0, seed=6, **CAMERA)
@@ -143,6 +145,7 @@ def test_a_start_without_a_metre_scale_is_a_choice() -> None:
     assert abs(scale - 1.0) < 0.05
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("solved", [True, False])
 def test_a_start_from_standstill_that_moves_off_slowly_is_corrected(
     solved: bool, data_dir: Path, monkeypatch: pytest.MonkeyPatch

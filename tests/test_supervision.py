@@ -9,6 +9,7 @@ from typing import Any
 import gtsam
 import numpy as np
 import pytest
+from groups import slow
 
 from slam_graph.backend.cost.gating import Innovations
 from slam_graph.config import RunConfig, load_config
@@ -79,8 +80,9 @@ def outcome(sequence: Any, algorithm: str, cameras: int, refused: bool = True) -
     return run(sequence, load_config(None, settings, algorithm=algorithm, cameras=cameras))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("cameras", [1, 2])
-@pytest.mark.parametrize("algorithm", ["msckf", "okvis"])
+@pytest.mark.parametrize("algorithm", ["msckf", slow("okvis")])
 def test_cameras_that_are_mounted_otherwise_make_a_run_diverge(
     algorithm: str, cameras: int
 ) -> None:
@@ -93,14 +95,14 @@ def test_cameras_that_are_mounted_otherwise_make_a_run_diverge(
     assert "images contradict the state" in result.message
 
 
-@pytest.mark.parametrize("cameras", [1, 2])
+@pytest.mark.parametrize("cameras", [slow(1), 2])
 def test_images_of_another_flight_make_a_run_diverge(cameras: int) -> None:
     result = outcome(Spliced(flight(0), flight(1, "random"), 3.0, np.inf), "msckf", cameras)
     assert result.status == "diverged"
     assert "images contradict the state" in result.message
 
 
-@pytest.mark.parametrize("cameras", [1, 2])
+@pytest.mark.parametrize("cameras", [slow(1), 2])
 def test_after_a_second_without_images_a_run_goes_on(cameras: int) -> None:
     result = outcome(Spliced(flight(0), None, 4.0, 5.0), "msckf", cameras)
     assert result.status == "ok"

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 from flight import Flight, rig, room, scene
+from groups import slow
 from gtsam.symbol_shorthand import X
 
 from slam_graph.arrays import FloatArray
@@ -150,7 +151,7 @@ class Recorded(PixelNoise):
         Recorded.last = self
 
 
-@pytest.mark.parametrize(("name", "learns"), [("msckf", True), ("ekf", False)])
+@pytest.mark.parametrize(("name", "learns"), [("msckf", True), slow("ekf", False)])
 def test_a_flight_finds_its_drift_and_knows_its_errors(
     name: str, learns: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -71,6 +71,7 @@ def drawn() -> tuple[FloatArray, FloatArray]:
     return np.array([nees for nees, _ in found]), np.array([scale for _, scale in found])
 
 
+@pytest.mark.slow
 def test_errors_far_from_the_start_are_as_large_as_the_covariances_say(
     drawn: tuple[FloatArray, FloatArray],
 ) -> None:
@@ -80,6 +81,7 @@ def test_errors_far_from_the_start_are_as_large_as_the_covariances_say(
     assert np.all(means[LATE] > low), means
 
 
+@pytest.mark.slow
 def test_the_scale_is_that_of_the_start_and_not_of_the_whole_path(
     drawn: tuple[FloatArray, FloatArray],
 ) -> None:

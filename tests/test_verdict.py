@@ -11,6 +11,7 @@ from typing import Any
 import gtsam
 import numpy as np
 import pytest
+from groups import slow
 from typer.testing import CliRunner
 
 from slam_graph.cli.main import app
@@ -114,8 +115,8 @@ def seen_by(
     ("wrong", "named"),
     [
         (with_double_baseline, "calibrated baseline is"),
-        (with_longer_lenses, "calibrated focal length is"),
-        (exchanged, "the cameras are exchanged"),
+        slow(with_longer_lenses, "calibrated focal length is"),
+        slow(exchanged, "the cameras are exchanged"),
     ],
 )
 def test_a_wrong_calibration_is_suspect(
@@ -136,7 +137,9 @@ def test_a_wrong_calibration_is_suspect(
     assert "slam-graph doctor" in done.stderr
 
 
-@pytest.mark.parametrize(("trajectory", "seed", "cameras"), [("figure8", 2, 2), ("random", 3, 1)])
+@pytest.mark.parametrize(
+    ("trajectory", "seed", "cameras"), [("figure8", 2, 2), slow("random", 3, 1)]
+)
 def test_a_right_one_is_not_even_if_it_is_doubted(
     trajectory: str, seed: int, cameras: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -165,21 +168,21 @@ def test_a_failure_of_the_clock_watch_costs_no_diagnosis(monkeypatch: pytest.Mon
     assert "calibrated focal length is 1." in result.message
 
 
-def test_a_quick_look_says_what_the_whole_diagnosis_says() -> None:
+@pytest.mark.parametrize("wrong", [slow(lambda rig: rig), slow(with_longer_lenses), turned])
+def test_a_quick_look_says_what_the_whole_diagnosis_says(wrong: Callable[[Rig], Rig]) -> None:
     """Where the calibration is right or nearly so; there is nothing else that it is for."""
-    for wrong in (lambda rig: rig, with_longer_lenses, turned):
-        recording = flown(wrong)
-        frames = [f for f in recording.frames() if isinstance(f, FeatureFrame)]
-        of = recording.rig, frames, recording.imu()
-        quick, whole = Diagnosis.nearby(*of), Diagnosis.of_tracks(*of)
-        kinds = [[f.kind for f in found.setup_faults] for found in (quick, whole)]
-        assert kinds[0] == kinds[1]
+    recording = flown(wrong)
+    frames = [f for f in recording.frames() if isinstance(f, FeatureFrame)]
+    of = recording.rig, frames, recording.imu()
+    quick, whole = Diagnosis.nearby(*of), Diagnosis.of_tracks(*of)
+    kinds = [[f.kind for f in found.setup_faults] for found in (quick, whole)]
+    assert kinds[0] == kinds[1]
 
 
 @pytest.mark.parametrize(
     ("recording", "named"),
     [
-        (lambda: flown(gyro=float(np.rad2deg(1.0))), "its unit is degrees/s"),
+        slow(lambda: flown(gyro=float(np.rad2deg(1.0))), "its unit is degrees/s"),
         (lambda: flown(inverted), "the calibration is inverted"),
     ],
 )
@@ -242,7 +245,7 @@ def test_a_failed_run_names_the_likeliest_cause() -> None:
     assert "likeliest cause" not in result.message, "it would contradict what is certain"
 
 
-@pytest.mark.parametrize("fault", ["extrinsics", "gyroscope"])
+@pytest.mark.parametrize("fault", [slow("extrinsics"), "gyroscope"])
 def test_a_wrong_setup_that_starts_is_refused_where_its_estimate_is_lost(fault: str) -> None:
     """A start at rest shows nothing of it."""
     sequence = simulate(trajectory="figure8", cameras=2, duration_s=20.0, rate_hz=RATE_HZ, seed=1)
@@ -263,6 +266,7 @@ def test_a_wrong_setup_that_starts_is_refused_where_its_estimate_is_lost(fault: 
     assert result.logs.frames / RATE_HZ < 11.0
 
 
+@pytest.mark.slow
 @pytest.mark.data
 @pytest.mark.parametrize(
     ("algorithm", "wrong", "named"),
@@ -287,7 +291,7 @@ def test_a_wrong_setup_under_which_an_estimate_lasts_is_refused_after_some_secon
     assert result.logs.frames / RATE_HZ - begun_s < 25.0
 
 
-@pytest.mark.parametrize("at_s", [2.5, 4.5])
+@pytest.mark.parametrize("at_s", [slow(2.5), 4.5])
 def test_a_good_flight_that_is_lost_soon_is_not_refused(at_s: float) -> None:
     """Whatever happened then, the calibration does not explain it."""
     flight = simulate(trajectory="figure8", cameras=2, duration_s=14.0, rate_hz=RATE_HZ, seed=2)
@@ -300,7 +304,7 @@ def test_a_good_flight_that_is_lost_soon_is_not_refused(at_s: float) -> None:
     ("duration_s", "faults"),
     [
         (8.0, ["imu_zeros:at_s=4,duration_s=1", "frames_dropped:at_s=6,duration_s=0.5"]),
-        (9.0, ["frames_dropped:at_s=6.6,duration_s=0.7", "gyro_outlier:at_s=3.5"]),
+        slow(9.0, ["frames_dropped:at_s=6.6,duration_s=0.7", "gyro_outlier:at_s=3.5"]),
     ],
 )
 def test_faults_that_leave_little_to_compare_make_no_calibration_wrong(
@@ -313,7 +317,7 @@ def test_faults_that_leave_little_to_compare_make_no_calibration_wrong(
     assert result.status in ("ok", "low_coverage"), result.message  # a take-off without IMU
 
 
-@pytest.mark.parametrize("with_imu", [True, False])
+@pytest.mark.parametrize("with_imu", [True, slow(False)])
 def test_a_run_that_contradicts_itself_is_suspect(
     monkeypatch: pytest.MonkeyPatch, with_imu: bool
 ) -> None:
@@ -329,7 +333,7 @@ def test_a_run_that_contradicts_itself_is_suspect(
     assert (result.evidence["position_shift"] is not None) == with_imu
 
 
-@pytest.mark.parametrize("ending", ["limits.recovery=false", "the segment is too short"])
+@pytest.mark.parametrize("ending", ["limits.recovery=false", slow("the segment is too short")])
 def test_what_follows_the_loss_that_ends_a_run_is_not_compared(
     ending: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -358,7 +362,7 @@ def test_what_follows_the_loss_that_ends_a_run_is_not_compared(
     assert "slam-graph doctor says" not in result.message
 
 
-@pytest.mark.parametrize(("all_used", "status"), [(True, "suspect"), (False, "ok")])
+@pytest.mark.parametrize(("all_used", "status"), [slow(True, "suspect"), (False, "ok")])
 def test_what_the_estimator_used_must_show_a_fault_as_well(all_used: bool, status: str) -> None:
     """Most features are on a body that looks like the world to a camera that is turned by 8°."""
     flight = simulate(trajectory="random", duration_s=12.0, rate_hz=RATE_HZ, seed=1)

@@ -11,6 +11,7 @@ import gtsam
 import numpy as np
 import pytest
 from flight import FISHEYE, RADTAN, Flight, packets, rig, room
+from groups import slow_but
 from typer.testing import CliRunner
 
 from slam_graph.arrays import FloatArray
@@ -34,6 +35,8 @@ from slam_graph.sensors.camera import Camera
 from slam_graph.sensors.measurements import FeatureFrame, FeatureObservations
 
 OWN = [n for n in algorithm_names() if load_config(algorithm=n).algorithm.engine == "square_root"]
+BRIEF = ("msckf", "okvis")
+"""Of these, what `make test` runs of the longer tests."""
 SMOOTHERS = [name for name in algorithm_names() if name not in OWN]
 SIGMAS = np.array([0.02, 0.05, 0.1, 0.1, 0.01])
 DOUBLE_SPHERE = Camera(200.0, 201.0, 254.0, 256.0, "double_sphere", (-0.1, 0.55), 512, 512)
@@ -127,7 +130,7 @@ def test_it_has_the_normal_equations_of_the_engine(name: str, cameras: int) -> N
     assert len(points) > 5
 
 
-@pytest.mark.parametrize("name", OWN)
+@pytest.mark.parametrize("name", slow_but(BRIEF, OWN))
 def test_so_it_has_at_every_frame_with_outliers(name: str) -> None:
     flight = steps(name, cameras=1, outliers=0.1)
     next(flight)  # the start, which has no step
@@ -181,12 +184,12 @@ def test_the_prior_is_made_of_it_where_the_last_step_began(
 
 
 @pytest.mark.parametrize("cameras", [1, 2])
-@pytest.mark.parametrize("name", OWN)
+@pytest.mark.parametrize("name", slow_but(BRIEF, OWN))
 def test_so_it_has_with_the_calibration_as_variables(name: str, cameras: int) -> None:
     check(flown(name, cameras=cameras, calibration=EVERYTHING))
 
 
-@pytest.mark.parametrize("name", OWN)
+@pytest.mark.parametrize("name", slow_but(BRIEF, OWN))
 def test_so_it_has_while_it_learns_the_noise_of_each_camera(name: str) -> None:
     learns = NoiseConfig(adaptive_pixels="any")
     before = np.ones(2)

@@ -12,6 +12,7 @@ import cv2
 import gtsam
 import numpy as np
 import pytest
+from groups import slow, slow_but
 from scipy.spatial.transform import Rotation
 
 from slam_graph import load_config, run
@@ -21,6 +22,7 @@ from slam_graph.backend.dynamics import Dynamics, model_rig, motionless_samples
 from slam_graph.backend.policies import AlgorithmConfig
 from slam_graph.backend.visual_motion import VisualMotion, depths_within, pose_of_most
 from slam_graph.backend.world_gauge import gauge_motion, with_unknown_gauge, world_motion
+from slam_graph.config import algorithm_names
 from slam_graph.datasets import open_dataset
 from slam_graph.errors import ConfigError, DataError
 from slam_graph.evaluation import ape
@@ -121,7 +123,8 @@ def test_dynamics_are_those_that_the_recording_has() -> None:
 
 
 @pytest.mark.parametrize(
-    "algorithm", ["msckf", "swf", "okvis", "ekf", "iekf", "fixed_lag_isam2", "fixed_lag_batch"]
+    "algorithm",
+    slow_but({"msckf"}, [name for name in algorithm_names() if name != "isam2"]),
 )
 def test_every_algorithm_runs_on_stereo_without_an_imu(algorithm: str) -> None:
     recording = simulated(cameras=2)
@@ -132,7 +135,7 @@ def test_every_algorithm_runs_on_stereo_without_an_imu(algorithm: str) -> None:
     assert ape(result.groundtruth, result.trajectory, "trans_part", "se3").statistics.rmse < 0.05
 
 
-@pytest.mark.parametrize("depth", ["stereo", "kinect"])
+@pytest.mark.parametrize("depth", ["stereo", slow("kinect")])
 def test_a_depth_sensor_takes_the_place_of_a_second_camera(depth: str) -> None:
     recording = simulated(cameras=1, depth={"sensor": depth})
     result = run(recording, algorithm="msckf", overrides=[OWN_START])
@@ -144,6 +147,7 @@ def test_a_depth_sensor_takes_the_place_of_a_second_camera(depth: str) -> None:
     assert smoothed < 0.006
 
 
+@pytest.mark.slow
 def test_what_is_known_without_an_imu_is_what_the_covariance_says() -> None:
     values = []
     for seed in range(6):
@@ -157,6 +161,7 @@ def test_what_is_known_without_an_imu_is_what_the_covariance_says() -> None:
     assert (np.mean(values, axis=0) > 1.0).all(), values
 
 
+@pytest.mark.slow
 def test_a_recording_with_an_imu_can_be_run_without_it(data_dir: Path) -> None:
     result = run(
         data_dir / "euroc" / "MH_01_easy_17s",
