@@ -26,9 +26,9 @@ def pytest_sessionstart(session: pytest.Session) -> None:
 
 
 LONGEST = (
-    "damaged_files", "diagnosis", "verdict", "recovery", "position_fixes", "experiment",
-    "map_runs", "estimator_end_to_end", "repeats", "notebooks", "clock_monitor", "signals",
-    "rolling_shutter", "final_ba", "rerun", "view_damaged", "damaged_results",
+    "damaged_files", "verdict", "recovery", "diagnosis", "experiment", "map_runs", "notebooks",
+    "position_fixes", "estimator_end_to_end", "clock_monitor", "rerun", "repeats", "signals",
+    "one_camera", "final_ba", "take_off", "rolling_shutter", "view_damaged", "damaged_results",
 )  # fmt: skip
 """Files of tests that take longest in the quick group; they run first, so that no core ends with
 one."""

@@ -8,10 +8,10 @@ import pytest
 from documented import pages_of
 from documented_runs import check_page
 from documented_stock import Stock
-from groups import slow_but
 
 
-@pytest.mark.parametrize("page", slow_but({"docs/simulation.md"}, pages_of("recordings")))
+@pytest.mark.slow
+@pytest.mark.parametrize("page", pages_of("recordings"))
 def test_every_step_works(
     page: str, stock: Stock, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -18,7 +18,6 @@ import numpy as np
 import pytest
 from commands import slam_graph
 from documented_runs import do_tasks_here
-from groups import slow
 from limits import HANG_S
 from test_batch import command as batch
 from test_batch import flight, wait_for, worker_of
@@ -65,7 +64,7 @@ def simulated(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("cameras", "alignment"), [(2, "se3"), slow(1, "sim3")])
+@pytest.mark.parametrize(("cameras", "alignment"), [(2, "se3"), (1, "sim3")])
 def test_without_an_imu_errors_are_aligned_in_what_nothing_measured(
     here: None, tmp_path: Path, cameras: int, alignment: str
 ) -> None:

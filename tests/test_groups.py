@@ -12,6 +12,8 @@ FILES = sorted(Path(__file__).parent.glob("test_*.py"))
 MARK = "pytest.mark.slow"
 
 SLOW_ALONE = {
+    "test_documented_recordings": "test_documented_start and test_documented_methods do steps of "
+    "pages, test_documented_commands looks at the names of commands and options of all",
     "test_long_flight": "minutes are its subject; `make gate` measures the same quantity",
     "test_relocalization": "places that join segments are in test_recovery, runs that are located "
     "in a map in test_map_runs, loops with a scale in test_loop_scale",

@@ -149,6 +149,7 @@ def test_depths_of_common_points_tell_the_scale() -> None:
     assert verifier.verify([first, blind], 0, 1, gravity=False) is None
 
 
+@pytest.mark.slow
 def test_loops_of_one_camera_correct_pose_and_scale() -> None:
     sequence = simulate(
         trajectory="rooms",

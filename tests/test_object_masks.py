@@ -202,7 +202,6 @@ def run_with_masks(recording: Path, masks: Path, output: Path) -> dict[str, Any]
     return metrics
 
 
-@pytest.mark.slow
 def test_a_parked_car_is_no_moving_object(
     still_world: tuple[Path, list[int]], tmp_path: Path
 ) -> None:

@@ -109,6 +109,7 @@ def test_smoothed_objects_are_better_than_those_on_the_way(two: RunResult) -> No
     assert causal["pose_translation_m"] < 0.03
 
 
+@pytest.mark.slow
 def test_files_of_smoothed_objects(two: RunResult, tmp_path: Path) -> None:
     two.save(tmp_path / "out")
     assert two.objects is not None
@@ -127,6 +128,7 @@ def test_files_of_smoothed_objects(two: RunResult, tmp_path: Path) -> None:
     assert all(np.linalg.eigvalsh(step.covariance)[0] > 0.0 for step in steps)
 
 
+@pytest.mark.slow
 def test_what_is_beyond_the_ground_truth_does_not_count(two: RunResult) -> None:
     truth = two.input.truth
     assert two.objects is not None
@@ -139,6 +141,7 @@ def test_what_is_beyond_the_ground_truth_does_not_count(two: RunResult) -> None:
     assert 0 < len(half.truth) < 0.7 * len(whole.truth)
 
 
+@pytest.mark.slow
 def test_smoothed_velocities_have_the_errors_that_they_say(two: RunResult) -> None:
     """Of the point of the body at which its origin is, against how it truly moved."""
     truth = two.input.truth

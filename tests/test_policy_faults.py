@@ -140,7 +140,7 @@ def sample(past_poses: str, features: str) -> Iterator[AlgorithmConfig]:
 
 
 @pytest.mark.parametrize("features", slow_but({"state", "once"}, FEATURE_POLICIES))
-@pytest.mark.parametrize("past_poses", slow_but({"most_recent", "keyframes"}, POSE_SELECTIONS))
+@pytest.mark.parametrize("past_poses", slow_but({"keyframes"}, POSE_SELECTIONS))
 def test_what_is_rejected_does_not_come_back(
     past_poses: str,
     features: str,

@@ -174,7 +174,7 @@ def batches() -> list[tuple[Rig, Batch]]:
 )
 @pytest.mark.parametrize(
     "past_poses",
-    slow_but({"most_recent", "keyframes", FROM_OUTSIDE[0]}, [*POSE_SELECTIONS, FROM_OUTSIDE[0]]),
+    slow_but({"most_recent", FROM_OUTSIDE[0]}, [*POSE_SELECTIONS, FROM_OUTSIDE[0]]),
 )
 def test_no_measurement_counts_twice(
     past_poses: str, features: str, batches: list[tuple[Rig, Batch]]

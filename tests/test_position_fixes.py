@@ -320,7 +320,8 @@ def test_a_drive_ends_in_the_world_of_the_fixes(algorithm: str) -> None:
     assert error_m(result, sequence) < 1.5
 
 
-@pytest.mark.parametrize(("given", "sigma"), [slow(-0.3, 0.0), (0.0, 0.3)])
+@pytest.mark.slow
+@pytest.mark.parametrize(("given", "sigma"), [(-0.3, 0.0), (0.0, 0.3)])
 def test_fixes_that_come_late_count_where_they_were_measured(given: float, sigma: float) -> None:
     """By an offset that is given, or found; neglected, it is 3 m on the road."""
     sequence = drive(30.0, rate_hz=10.0, gnss={"sigma_m": 0.3, "rate_hz": 2.0, "late_s": 0.3})

@@ -106,9 +106,7 @@ def test_time_between_segments_is_not_covered(blind: RunResult, tmp_path: Path) 
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "fault", [slow("imu_missing:at_s=6,duration_s=1.5"), "frames_dropped:at_s=6"]
-)
+@pytest.mark.parametrize("fault", ["imu_missing:at_s=6,duration_s=1.5", "frames_dropped:at_s=6"])
 def test_one_sensor_alone_goes_on_without_the_other(fault: str) -> None:
     result = flown(fault)
     assert result.status == "ok"
@@ -211,7 +209,8 @@ def test_a_single_correction_after_a_pause_is_no_contradiction() -> None:
     assert corrections.agreed_until() is None
 
 
-@pytest.mark.parametrize("algorithm", ["swf", slow("okvis"), slow("fixed_lag_isam2")])
+@pytest.mark.slow
+@pytest.mark.parametrize("algorithm", ["swf", "okvis", "fixed_lag_isam2"])
 def test_every_engine_starts_again(algorithm: str) -> None:
     result = flown("all_missing:at_s=6,duration_s=2", algorithm=algorithm)
     assert result.status == "ok"
@@ -263,6 +262,7 @@ def test_a_segment_somewhere_else_is_not_joined_and_places_join_it(tmp_path: Pat
     assert float(rows_saved[1]["joint_cov_55"]) == pytest.approx(joint.covariance[5, 5])
 
 
+@pytest.mark.slow
 def test_worlds_that_are_not_joined_are_smoothed_apart() -> None:
     result = flown("kidnapped:at_s=6,duration_s=3.7", settings=())
     assert [segment.joined_by for segment in result.segments] == ["start", "none"]

@@ -9,7 +9,6 @@ import gtsam
 import numpy as np
 import pytest
 from flight import FISHEYE, RADTAN, Flight, rig, room, scene
-from groups import slow_but
 from gtsam.symbol_shorthand import B, L, V, X
 
 from slam_graph.backend.backend_config import BackendConfig
@@ -78,7 +77,7 @@ def test_a_smoother_gives_back_its_prior(name: str) -> None:
 
 @pytest.mark.slow
 @pytest.mark.data
-@pytest.mark.parametrize("name", slow_but({"fixed_lag_isam2"}, SOLVERS))
+@pytest.mark.parametrize("name", SOLVERS)
 def test_the_wheels_tracks(data_dir: Path, name: str) -> None:
     """From rest through the take-off into the flight, without being told the start state."""
     truth = data_dir / "euroc_inertial" / "V1_01_easy"

@@ -172,6 +172,7 @@ def test_a_start_from_standstill_that_moves_off_slowly_is_corrected(
     assert error.statistics.rmse < 0.01
 
 
+@pytest.mark.slow
 def test_images_that_are_lost_later_do_not_bring_the_start_in_doubt() -> None:
     """Without features the velocity becomes unknown, long after the start was confirmed."""
     sequence = simulate(trajectory="figure8", duration_s=16.0, seed=5, **CAMERA)

@@ -82,7 +82,7 @@ def outcome(sequence: Any, algorithm: str, cameras: int, refused: bool = True) -
 
 @pytest.mark.slow
 @pytest.mark.parametrize("cameras", [1, 2])
-@pytest.mark.parametrize("algorithm", ["msckf", slow("okvis")])
+@pytest.mark.parametrize("algorithm", ["msckf", "okvis"])
 def test_cameras_that_are_mounted_otherwise_make_a_run_diverge(
     algorithm: str, cameras: int
 ) -> None:

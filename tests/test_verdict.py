@@ -151,6 +151,7 @@ def test_a_right_one_is_not_even_if_it_is_doubted(
     assert result.status == "ok", result.message
 
 
+@pytest.mark.slow
 def test_a_fault_that_nothing_in_the_run_shows_is_suspect() -> None:
     result = run(flown(lambda rig: with_longer_lenses(rig, 1.1)), overrides=CAUSAL)
     assert result.status == "suspect", result.message
