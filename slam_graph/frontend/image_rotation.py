@@ -129,8 +129,9 @@ class _Pair:
     """
 
     def __init__(self, one: SmallImage, other: SmallImage, camera: FloatArray) -> None:
-        slopes = cv2.Sobel(one, -1, 1, 0, scale=0.125), cv2.Sobel(one, -1, 0, 1, scale=0.125)
-        self._images = one, other, *slopes, camera, _STRIDE
+        along_u = np.asarray(cv2.Sobel(one, -1, 1, 0, scale=0.125), np.float32)
+        along_v = np.asarray(cv2.Sobel(one, -1, 0, 1, scale=0.125), np.float32)
+        self._images = one, other, along_u, along_v, camera, _STRIDE
         self._least = _LEAST_OVERLAP * one.size / _STRIDE**2
 
     def at(self, R: FloatArray) -> _Aligned:
@@ -139,7 +140,7 @@ class _Pair:
         count = turn_equations(*self._images, R, lhs, rhs)
         cost = rhs[3] / count if count >= self._least else math.inf
         # the first image turned by a small angle has the slopes of itself
-        return _Aligned(R, cost, np.linalg.solve(lhs + _DAMPING, rhs[:3]))
+        return _Aligned(R, cost, np.asarray(np.linalg.solve(lhs + _DAMPING, rhs[:3])))
 
     def refined(self, found: _Aligned) -> _Aligned:
         """The rotation after Gauss-Newton steps."""

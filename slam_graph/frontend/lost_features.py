@@ -200,7 +200,7 @@ class LostFeatures:
         missing = [~are_among(past.tracks.ids, after.ids) for past in self._past]
         pairs = zip(missing, self._past, strict=True)
         counts = (np.count_nonzero(away & (past.tries < _TRIES)) for away, past in pairs)
-        return max(counts, default=0)
+        return max(map(int, counts), default=0)
 
     def _count_tries(self, ids: IntArray) -> None:
         """Note that corners are looked for, whichever image they are taken from."""

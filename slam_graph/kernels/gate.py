@@ -64,9 +64,7 @@ def observation_distances_numpy(
 
 
 @compiled("void(f8[:, :, ::1], f8[::1, :], i8[:, ::1], f8[:, ::1])")
-def observation_rows(
-    H: FloatArray, root: FloatArray, columns: IntArray, rows: FloatArray
-) -> None:
+def observation_rows(H: FloatArray, root: FloatArray, columns: IntArray, rows: FloatArray) -> None:
     """Derivatives H rootᵀ of single observations by whitened variables x, δ = rootᵀ x.
 
     Args:

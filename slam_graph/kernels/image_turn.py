@@ -66,7 +66,7 @@ def turn_equations(
             v = fy * ((R[1, 0] * x + R[1, 1] * y + R[1, 2]) / ahead) + cy
             if not (0.0 <= u < w - 1 and 0.0 <= v < h - 1):
                 continue
-            left, top = int(math.floor(u)), int(math.floor(v))
+            left, top = math.floor(u), math.floor(v)
             a, b = u - left, v - top
             above = (1.0 - a) * other[top, left] + a * other[top, left + 1]
             below = (1.0 - a) * other[top + 1, left] + a * other[top + 1, left + 1]

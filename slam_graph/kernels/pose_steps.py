@@ -142,8 +142,9 @@ def pose_steps_numpy(
         if scale is None:
             return
         none, i = np.zeros_like(x), 1.0 / seen[ahead, 2]
-        rows = [-x * y, 1.0 + x * x, -y, i, none, -x * i], [-(1.0 + y * y), x * y, x, none, i, -y * i]
-        J = np.array(rows).transpose(2, 0, 1)
+        along_x = -x * y, 1.0 + x * x, -y, i, none, -x * i
+        along_y = -(1.0 + y * y), x * y, x, none, i, -y * i
+        J = np.array([along_x, along_y]).transpose(2, 0, 1)
         w = np.where(chosen[ahead], (1.0 + (errors[ahead] / scale) ** 2) ** -2.0, 0.0)
         A = np.einsum("n,nij,nik->jk", w, J, J) + _DAMPING * np.eye(6)
         step = np.linalg.solve(A, np.einsum("n,nij,ni->j", w, J, r))

@@ -14,12 +14,13 @@ that a pose which follows them fits nearly all of the farther ones too, if these
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from slam_graph.arrays import BoolArray, FloatArray
+from slam_graph.arrays import BoolArray, FloatArray, median
 from slam_graph.backend.cost.cost import Cost, Linearization
 from slam_graph.backend.cost.feature_factors import WhitenedObservations, sum_features
 from slam_graph.backend.cost.gating import (
@@ -164,13 +165,14 @@ def _consensus(cost: Cost, linear: Linearization) -> _Consensus | None:
     errors = linear.errors[np.isfinite(linear.errors)]
     if not len(errors):
         return None
-    limit = WIDTH_2D / MEDIAN_2D * float(np.median(errors))
+    limit = WIDTH_2D / MEDIAN_2D * float(median(errors))
     worst, depths = _of_features(cost, linear)
     # nearer or behind, the slope of the projection tells nothing
     fits = (worst < limit) & (depths >= cost.config.triangulation.min_depth_m)
     if np.sum(fits) < max(_FEWEST, _LEAST_SHARE * len(fits)):
         return None
-    fits &= depths >= np.quantile(depths[fits], _NEAREST)
+    ascending = np.sort(depths[fits])
+    fits &= depths >= ascending[math.ceil(_NEAREST * (len(ascending) - 1))]
     count = 0 if linear.landmarks is None else len(linear.landmarks.errors)
     return _Consensus(fits[:count], fits[count:])
 

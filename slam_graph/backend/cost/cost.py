@@ -335,7 +335,6 @@ class Cost:
         linear: Linearization,
         predicted: SquareRootInformation,
         tested: BoolArray | None = None,
-        confidence: float | None = None,
         admitted: tuple[BoolArray | bool, BoolArray | bool] = (True, True),
         root: TailRoot | None = None,
     ) -> Gate:
@@ -346,13 +345,11 @@ class Cost:
                 residuals any would pass (`Linearization.unweighted`).
             predicted: what is known of the variables before these measurements.
             tested: (J,) which of the new features are tested; all of them if it is not given.
-            confidence: share of good ones that pass; that of the settings if it is not given.
             admitted: which observations (N,) and which of the tested features may pass; else all.
-            root: of the covariance of all columns that observations have, if it is known.
+            root: of the covariance of what they depend on, if it is known.
         """
-        landmarks = np.zeros(0, np.bool_)
-        tracks = np.zeros(0, np.bool_)
-        innovations, confidence = Innovations(), confidence or self.config.gating.confidence
+        landmarks = tracks = np.zeros(0, np.bool_)
+        innovations, confidence = Innovations(), self.config.gating.confidence
         obs = None if self.tracks is None or linear.tracks is None else self.tracks.obs
         if obs is not None and tested is not None:  # they are new: few poses have seen them
             obs, tracks = obs.subset(tested).without_idle_frames(), np.zeros(len(tested), np.bool_)
@@ -370,11 +367,11 @@ class Cost:
             landmarks = (distance < largest) & ~near & admitted[0]
             innovations += Innovations.of(distance, dof, largest, landmarks)
         if obs is not None and len(obs) and self.tracks is not None:
-            assert isinstance(linear.tracks, WhitenedObservations), "these are not told apart"
             observations = linear.tracks
+            assert isinstance(observations, WhitenedObservations), "these are not told apart"
             if tested is not None:
                 observations = observations.subset(tested[self.tracks.obs.feature])
-            above = int(of_poses.min()) - first  # rows that are zero there: the root is triangular
+            above = int(of_poses.min()) - first  # rows before are zero: the root is triangular
             root_of_poses = W[above:, of_poses - first]
             covariance = root_of_poses.T @ root_of_poses
             distance = distances_of_tracks(obs, observations, covariance)

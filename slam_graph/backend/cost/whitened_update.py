@@ -45,7 +45,7 @@ class TailRoot:
 
     def columns(self, numbers: NDArray[np.intp]) -> FloatArray:
         """Columns (m, k) of it, by their numbers in the Gaussian."""
-        return self.W.take(numbers - self.first, axis=1)
+        return np.asarray(self.W.T.take(numbers - self.first, axis=0).T)  # contiguous ones
 
 
 class WhitenedUpdate:
@@ -84,5 +84,5 @@ class WhitenedUpdate:
     def covariance(self, columns: NDArray[np.intp]) -> FloatArray:
         """The covariance (k, k) of some columns."""
         W = self._root.columns(columns)
-        less, _ = lapack.dtrtrs(self._L, self._Y @ W, lower=1)
+        less, _ = lapack.dtrtrs(self._L, np.asfortranarray(self._Y @ W), lower=1, overwrite_b=1)
         return np.asarray(W.T @ W - less.T @ less)
