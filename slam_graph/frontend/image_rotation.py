@@ -29,7 +29,7 @@ _WIDTH = 80
 """Width of the small images, in pixels."""
 _STEPS = 8
 _SMALLEST_STEP = 1e-3
-"""Steps end below this angle, rad: half a pixel of a large image. What is left then is much less."""
+"""Steps end below this angle, rad: half a pixel of a large image. Much less is left then."""
 _STRIDE = 2
 """One pixel of so many is compared, in rows and in columns. Between all pixels the rotation differs
 by 0.3 mrad in the median."""
@@ -50,6 +50,9 @@ class ImageRotation:
     """Aligns the images of one camera.
 
     A lens with distortion is taken for a pinhole: what that costs is within the search of tracking.
+
+    Attributes:
+        fits: whether the last rotation that `between` found aligns its images well.
     """
 
     def __init__(self, camera: Camera) -> None:
@@ -60,6 +63,7 @@ class ImageRotation:
         self._window = cv2.createHanningWindow(self._size, cv2.CV_32F)
         self._last: tuple[Image, SmallImage] | None = None
         self._turn = np.eye(3)
+        self.fits = False
 
     def between(self, before: Image, after: Image) -> FloatArray:
         """after_R_before (3, 3) of the camera."""
@@ -76,7 +80,8 @@ class ImageRotation:
             found.append(pair.refined(guess))
             if found[-1].cost < enough:
                 break
-        self._turn = min(found, key=_cost_of).R
+        best = min(found, key=_cost_of)
+        self._turn, self.fits = best.R, best.cost < enough
         return self._turn
 
     def aligned(self, one: SmallImage, after: Image, guess: FloatArray) -> FloatArray:

@@ -3,8 +3,8 @@
 """An update of a Gaussian by a few rows, where little is asked of the outcome.
 
 Over the whitened variables x with δ = Wᵀ x, where P = Wᵀ W is the covariance, the Gaussian is
-‖x - d‖² and rows [A b] are [Y b] with Y = A Wᵀ. They move the mean to d + Yᵀ (Y Yᵀ + I)⁻¹ (b - Y d),
-and leave the covariance Wᵀ (I - Yᵀ (Y Yᵀ + I)⁻¹ Y) W: that of an extended Kalman filter. Where W is
+‖x - d‖² and rows [A b] are [Y b] with Y = A Wᵀ. They move the mean to d + Yᵀ (Y Yᵀ + I)⁻¹ (b - Y d)
+and leave the covariance Wᵀ (I - Yᵀ (Y Yᵀ + I)⁻¹ Y) W, as in an extended Kalman filter. Where W is
 there already and the rows are few, that takes a quarter of the time of an update of the triangle by
 QR and its inverse.
 """
