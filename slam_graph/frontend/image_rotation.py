@@ -13,7 +13,7 @@ whichever fits best.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -22,7 +22,7 @@ from scipy.spatial.transform import Rotation
 
 from slam_graph.arrays import FloatArray
 from slam_graph.frontend.keypoints import Image
-from slam_graph.kernels.image_turn import turn_equations
+from slam_graph.kernels.image_turn import turn_steps
 from slam_graph.sensors import Camera
 
 _WIDTH = 80
@@ -37,8 +37,6 @@ _BLUR = 1.0
 """Standard deviation, in small pixels, of the blur that makes alignment smooth."""
 _FITTING = 0.2
 """Images fit if they differ by less than this part of their contrast, squared."""
-_DAMPING = 1e-6 * np.eye(3)
-"""Of the normal equations, grey values squared: images without contrast do not turn."""
 _LEAST_OVERLAP = 0.4
 """Part of the image that both must show."""
 
@@ -95,7 +93,7 @@ class ImageRotation:
         if self._last is not None and self._last[0] is image:
             return self._last[1]
         reduced: cv2.typing.MatLike = image
-        while reduced.shape[1] >= 4 * _WIDTH:  # halving is ten times as fast as any other factor
+        while reduced.shape[1] >= 2 * _WIDTH:  # halving is ten times as fast as any other factor
             half = reduced.shape[1] // 2, reduced.shape[0] // 2
             reduced = cv2.resize(reduced, half, interpolation=cv2.INTER_AREA)
         reduced = cv2.resize(reduced, self._size, interpolation=cv2.INTER_AREA)
@@ -116,12 +114,10 @@ class _Aligned:
     Attributes:
         R: (3, 3) other_R_one.
         cost: mean squared difference; infinite with too little overlap.
-        step: (3,) the Gauss-Newton step from there, rad.
     """
 
     R: FloatArray
     cost: float
-    step: FloatArray
 
 
 class _Pair:
@@ -136,25 +132,18 @@ class _Pair:
     def __init__(self, one: SmallImage, other: SmallImage, camera: FloatArray) -> None:
         along_u = np.asarray(cv2.Sobel(one, -1, 1, 0, scale=0.125), np.float32)
         along_v = np.asarray(cv2.Sobel(one, -1, 0, 1, scale=0.125), np.float32)
-        self._images = one, other, along_u, along_v, camera, _STRIDE
+        self._images = one, other, along_u, along_v, camera
         self._least = _LEAST_OVERLAP * one.size / _STRIDE**2
 
-    def at(self, R: FloatArray) -> _Aligned:
-        """How well a rotation (3, 3) aligns them."""
-        lhs, rhs = np.empty((3, 3)), np.empty(4)
-        count = turn_equations(*self._images, R, lhs, rhs)
-        cost = rhs[3] / count if count >= self._least else math.inf
-        # the first image turned by a small angle has the slopes of itself
-        return _Aligned(R, cost, np.asarray(np.linalg.solve(lhs + _DAMPING, rhs[:3])))
+    def at(self, R: FloatArray, steps: int = 0) -> _Aligned:
+        """How well a rotation (3, 3) aligns them, after so many Gauss-Newton steps from it."""
+        turned = np.array(R, np.float64, order="C")
+        squares, count = turn_steps(*self._images, _STRIDE, steps, _SMALLEST_STEP, turned)
+        return _Aligned(turned, squares / count if count >= self._least else math.inf)
 
     def refined(self, found: _Aligned) -> _Aligned:
         """The rotation after Gauss-Newton steps."""
-        for _ in range(_STEPS):
-            R = found.R @ Rotation.from_rotvec(-found.step).as_matrix()
-            if math.hypot(*found.step) < _SMALLEST_STEP:
-                return replace(found, R=R)
-            found = self.at(R)
-        return found
+        return self.at(found.R, _STEPS)
 
 
 def _cost_of(found: _Aligned) -> float:

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""Normal equations of the rotation between two small images, for direct alignment."""
+"""The rotation between two small images by direct alignment."""
 
 from __future__ import annotations
 
@@ -8,22 +8,22 @@ import math
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from slam_graph.arrays import FloatArray
 from slam_graph.kernels.compilation import compiled
 
-__all__ = ["turn_equations", "turn_equations_numpy"]
+__all__ = ["turn_steps", "turn_steps_numpy"]
 
 _Grey = NDArray[np.float32]
 _AHEAD = 1e-3
 """Rays that are turned to less than this along the axis are out of view."""
+_DAMPING = 1e-6
+"""Of the normal equations, grey values squared: images without contrast do not turn."""
 
 
-@compiled(
-    "i8(f4[:, ::1], f4[:, ::1], f4[:, ::1], f4[:, ::1], f8[::1], i8, f8[:, ::1], f8[:, ::1],"
-    " f8[::1])"
-)
-def turn_equations(
+@compiled()
+def _equations(
     one: _Grey,
     other: _Grey,
     along_u: _Grey,
@@ -34,21 +34,9 @@ def turn_equations(
     lhs: FloatArray,
     rhs: FloatArray,
 ) -> int:
-    """Of the differences of an image and another one as the first camera would see it.
+    """Fill JᵀJ (3, 3), and Jᵀd and the sum of d² (4,), of the differences d; how many there are.
 
-    Args:
-        one: (h, w) grey values of the first image.
-        other: (h, w) of the second.
-        along_u: (h, w) slopes of the first image to the right, per pixel.
-        along_v: (h, w) downwards.
-        camera: (4,) fx, fy, cx, cy in pixels of these images.
-        stride: one pixel of so many is compared, in rows and in columns.
-        R: (3, 3) other_R_one of the camera.
-        lhs: (3, 3), filled with JᵀJ, where J are slopes by a turn of the points before the camera.
-        rhs: (4,), filled with Jᵀd and the sum of the squares of the differences d.
-
-    Returns:
-        How many of these pixels both images show.
+    J are the slopes by a turn of the points before the camera.
     """
     h, w = one.shape
     fx, fy, cx, cy = camera[0], camera[1], camera[2], camera[3]
@@ -94,7 +82,107 @@ def turn_equations(
     return count
 
 
-def turn_equations_numpy(
+@compiled()
+def _turn(R: FloatArray, theta: FloatArray) -> None:
+    """R Exp(-theta) in the place of R (3, 3), by Rodrigues."""
+    square = theta[0] * theta[0] + theta[1] * theta[1] + theta[2] * theta[2]
+    angle = math.sqrt(square)
+    sine, versine = 1.0 - square / 6.0, 0.5 - square / 24.0
+    if angle > 1e-3:
+        sine, versine = math.sin(angle) / angle, (1.0 - math.cos(angle)) / square
+    for i in range(3):
+        x, y, z = R[i, 0], R[i, 1], R[i, 2]
+        a = theta[1] * z - theta[2] * y
+        b = theta[2] * x - theta[0] * z
+        c = theta[0] * y - theta[1] * x
+        R[i, 0] = x + sine * a + versine * (theta[1] * c - theta[2] * b)
+        R[i, 1] = y + sine * b + versine * (theta[2] * a - theta[0] * c)
+        R[i, 2] = z + sine * c + versine * (theta[0] * b - theta[1] * a)
+
+
+@compiled()
+def _solve(A: FloatArray, b: FloatArray) -> None:
+    """The solution of A x = b for a positive definite A (3, 3), in the place of b[:3], by LDLᵀ."""
+    d0, a10, a20, b0 = A[0, 0], A[1, 0], A[2, 0], b[0]
+    l10, l20 = a10 / d0, a20 / d0
+    d1 = A[1, 1] - l10 * a10
+    l21 = (A[2, 1] - l20 * a10) / d1
+    d2 = A[2, 2] - l20 * a20 - l21 * l21 * d1
+    y1 = b[1] - l10 * b0
+    b[2] = (b[2] - l20 * b0 - l21 * y1) / d2
+    b[1] = y1 / d1 - l21 * b[2]
+    b[0] = b0 / d0 - l10 * b[1] - l20 * b[2]
+
+
+@compiled(
+    "UniTuple(f8, 2)(f4[:, ::1], f4[:, ::1], f4[:, ::1], f4[:, ::1], f8[::1], i8, i8, f8,"
+    " f8[:, ::1])"
+)
+def turn_steps(
+    one: _Grey,
+    other: _Grey,
+    along_u: _Grey,
+    along_v: _Grey,
+    camera: FloatArray,
+    stride: int,
+    steps: int,
+    smallest: float,
+    R: FloatArray,
+) -> tuple[float, float]:
+    """Gauss-Newton steps on the differences of two images, as the first camera would see both.
+
+    Args:
+        one: (h, w) grey values of the first image.
+        other: (h, w) of the second.
+        along_u: (h, w) slopes of the first image to the right, per pixel.
+        along_v: (h, w) downwards.
+        camera: (4,) fx, fy, cx, cy in pixels of these images.
+        stride: one pixel of so many is compared, in rows and in columns.
+        steps: at most so many; none only compares.
+        smallest: a step below this, rad, is the last one.
+        R: (3, 3) other_R_one of the camera, turned.
+
+    Returns:
+        The sum of the squared differences where they were last taken, which is at the end or before
+        a last small step, and how many there are.
+    """
+    lhs, rhs = np.empty((3, 3)), np.empty(4)
+    count = _equations(one, other, along_u, along_v, camera, stride, R, lhs, rhs)
+    for _ in range(steps):
+        for i in range(3):
+            lhs[i, i] += _DAMPING
+        _solve(lhs, rhs)
+        # the first image turned by a small angle has the slopes of itself
+        _turn(R, rhs[:3])
+        if rhs[0] * rhs[0] + rhs[1] * rhs[1] + rhs[2] * rhs[2] < smallest * smallest:
+            break
+        count = _equations(one, other, along_u, along_v, camera, stride, R, lhs, rhs)
+    return rhs[3], float(count)
+
+
+def turn_steps_numpy(
+    one: _Grey,
+    other: _Grey,
+    along_u: _Grey,
+    along_v: _Grey,
+    camera: FloatArray,
+    stride: int,
+    steps: int,
+    smallest: float,
+    R: FloatArray,
+) -> tuple[float, float]:
+    """`turn_steps` in NumPy."""
+    J, d = _differences(one, other, along_u, along_v, camera, stride, R)
+    for _ in range(steps):
+        step = np.linalg.solve(J.T @ J + _DAMPING * np.eye(3), J.T @ d)
+        R[:] = R @ Rotation.from_rotvec(-step).as_matrix()
+        if np.linalg.norm(step) < smallest:
+            break
+        J, d = _differences(one, other, along_u, along_v, camera, stride, R)
+    return float(d @ d), float(len(d))
+
+
+def _differences(
     one: _Grey,
     other: _Grey,
     along_u: _Grey,
@@ -102,10 +190,8 @@ def turn_equations_numpy(
     camera: FloatArray,
     stride: int,
     R: FloatArray,
-    lhs: FloatArray,
-    rhs: FloatArray,
-) -> int:
-    """`turn_equations` in NumPy."""
+) -> tuple[FloatArray, FloatArray]:
+    """Slopes J (N, 3) by a turn and differences d (N,)."""
     h, w = one.shape
     v, u = np.mgrid[:h, :w]
     x, y = (u - camera[2]) / camera[0], (v - camera[3]) / camera[1]
@@ -123,6 +209,4 @@ def turn_equations_numpy(
     d = (1.0 - b) * above + b * below - one[inside]
     su, sv = camera[0] * along_u[inside], camera[1] * along_v[inside]
     turns = -(su * x * y + sv * (1 + y * y)), su * (1 + x * x) + sv * x * y, sv * x - su * y
-    J = np.stack(turns, axis=1)
-    lhs[:], rhs[:3], rhs[3] = J.T @ J, J.T @ d, d @ d
-    return int(np.count_nonzero(inside))
+    return np.stack(turns, axis=1), d
