@@ -162,7 +162,7 @@ class VisualMotion:
         located = np.ones(len(ids), np.bool_)
         if last is not None:
             again = frame.cameras[0].ids
-            again = again[~np.isin(again, ids)]
+            again = again[~is_in(again, np.sort(ids))]
             seen = depths_within(last.only(again), self._rig, self._rate(before))
             world = np.asarray(before.world_T_body.transformFrom(seen.points.T)).T
             ids = np.concatenate([ids, seen.ids])

@@ -89,7 +89,7 @@ class CameraTracker:
             self._predictor.advance(before.stamp_ns, stamp_ns)
             if self._rotation is not None and before.image is not None:
                 turn = self._rotation.between(before.image, image)
-                self._predictor.turn(turn, self._rotation.fits)
+                self._predictor.turn(turn, self._rotation.close)
                 if self._lost is not None:
                     self._lost.turn(turn)
             guess = self._predictor.predict(before, stamp_ns, feedback)

@@ -37,6 +37,8 @@ _BLUR = 1.0
 """Standard deviation, in small pixels, of the blur that makes alignment smooth."""
 _FITTING = 0.2
 """Images fit if they differ by less than this part of their contrast, squared."""
+_CLOSELY = 0.1
+"""The same part where a rotation is good to a few pixels: not in images that are blurred."""
 _LEAST_OVERLAP = 0.4
 """Part of the image that both must show."""
 
@@ -50,7 +52,7 @@ class ImageRotation:
     A lens with distortion is taken for a pinhole: what that costs is within the search of tracking.
 
     Attributes:
-        fits: whether the last rotation that `between` found aligns its images well.
+        close: whether the last rotation that `between` found is good to a few pixels.
     """
 
     def __init__(self, camera: Camera) -> None:
@@ -61,7 +63,7 @@ class ImageRotation:
         self._window = cv2.createHanningWindow(self._size, cv2.CV_32F)
         self._last: tuple[Image, SmallImage] | None = None
         self._turn = np.eye(3)
-        self.fits = False
+        self.close = False
 
     def between(self, before: Image, after: Image) -> FloatArray:
         """after_R_before (3, 3) of the camera."""
@@ -69,7 +71,8 @@ class ImageRotation:
         other = self.reduced(after)
         self._last = after, other
         pair = _Pair(one, other, self._camera)
-        enough = _FITTING * float(np.vdot(one, one)) / one.size
+        contrast = float(np.vdot(one, one)) / one.size
+        enough = _FITTING * contrast
         guesses = [pair.at(self._turn)]
         if guesses[0].cost >= enough:
             guesses += [pair.at(np.eye(3)), pair.at(self._by_shift(one, other))]
@@ -79,7 +82,7 @@ class ImageRotation:
             if found[-1].cost < enough:
                 break
         best = min(found, key=_cost_of)
-        self._turn, self.fits = best.R, best.cost < enough
+        self._turn, self.close = best.R, best.cost < _CLOSELY * contrast
         return self._turn
 
     def aligned(self, one: SmallImage, after: Image, guess: FloatArray) -> FloatArray:

@@ -38,7 +38,7 @@ _TRIES = 3
 """A corner is looked for in so many good images."""
 _GOOD = 0.75
 """An image is good if this part of the corners is left that there were after the one before."""
-_LONGEST_PAUSE = 16
+_LONGEST_PAUSE = 32
 """As many images are left out at most between two that are searched."""
 _FITTING = 0.7
 """Part of the corners that must fit the motion. A wrong one is on its epipolar line by chance once

@@ -165,12 +165,13 @@ class PointPredictor:
             body_R_camera = self._body_T_camera.rotation().matrix()
             self.camera_R = body_R_camera.T @ start_R_end.matrix().T @ body_R_camera
 
-    def turn(self, end_R_start: FloatArray, fits: bool) -> None:
+    def turn(self, end_R_start: FloatArray, close: bool) -> None:
         """Take a rotation (3, 3) of the camera over two frames that the gyroscope did not give.
 
-        It is good to a few pixels if it `fits`, which is not enough to test tracks by it.
+        If it is `close`, to a few pixels, features are looked for near where it puts them; to test
+        their tracks by it that is not enough.
         """
-        self.camera_R, self._turn_known = end_R_start, fits
+        self.camera_R, self._turn_known = end_R_start, close
 
     def predict(self, before: Tracks, stamp_ns: int, feedback: Feedback) -> Prediction:
         """Where to look for the features of the image before.
