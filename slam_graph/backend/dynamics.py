@@ -40,13 +40,12 @@ _STATE_FEATURE_FRAMES = 2
 """Features enter the state when so many frames have seen them: without an IMU they are what holds
 the pose from frame to frame."""
 
-_MORE_WITH_DEPTH = 2.5
-"""With a depth sensor, how many times as many features are held in the state as with an IMU. Two
-cameras hold as many: they know far points less exactly than a filter can linearise, so more
-features make it too sure, and cost time. On simulated flights of `msckf` the NEES of position and
-orientation is 3.3 and 3.0 with 40 features, 3.6 and 3.3 with 50 and 4.6 and 4.1 with 60, where 4.16
-is the bar, and the error of the position 12.3 mm with 40 and 11.4 with 50. With 100 the NEES of
-position is twice as large as with 40."""
+_MORE_FEATURES, _MORE_WITH_DEPTH = 1.25, 2.5
+"""How many times as many features are held in the state as with an IMU. Two cameras know far
+points less exactly than a filter can linearise, so more features make it too sure: on simulated
+flights of `msckf` the NEES of position and orientation is 4.6 and 4.1 with 60 features (1.5 times)
+and 3.7 and 3.5 with 50, where 4.16 is the bar. With 100 the NEES of position is twice as large as
+with 40. With 40 a box that begins to move pulls the pose in two of 13 flights, by 0.09 and 0.25 m."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -163,20 +162,21 @@ def without_imu(config: BackendConfig, has_scale: bool) -> BackendConfig:
 def without_prediction(algorithm: AlgorithmConfig, rig: Rig) -> AlgorithmConfig:
     """The policies for frames whose poses nothing but their features tells.
 
-    Features enter early, where nothing else was asked for. Where their distances are measured,
-    those that are lost are kept: they are what a turn there and back is measured against. With a
-    depth sensor more of them are held. In GTSAM's smoothers every frame is a state, and the lag is
-    half as long, so that they hold about as many as with an IMU.
+    Features enter early, where nothing else was asked for. Where their distances are measured, more
+    of them are held, and those that are lost are kept: they are what a turn there and back is
+    measured against. In GTSAM's smoothers every frame is a state, and the lag is half as long, so
+    that they hold about as many as with an IMU.
     """
     cost, smoother = algorithm.cost, algorithm.smoother
     if cost.max_state_features != 0 and cost.state_feature_frames is None:
         cost = cost.model_copy(update={"state_feature_frames": _STATE_FEATURE_FRAMES})
     if cost.max_state_features != 0 and rig.has_scale:
+        more = _MORE_FEATURES if rig.depth is None else _MORE_WITH_DEPTH
         update: dict[str, Any] = {}
         if cost.keep_lost_features is None:
             update["keep_lost_features"] = True
-        if cost.max_state_features is not None and rig.depth is not None:
-            update["max_state_features"] = round(_MORE_WITH_DEPTH * cost.max_state_features)
+        if cost.max_state_features is not None:
+            update["max_state_features"] = round(more * cost.max_state_features)
         cost = cost.model_copy(update=update)
     early: dict[str, Any] = {"spacing_s": 0.0, "lag_s": 0.5 * smoother.lag_s}
     if smoother.min_feature_frames is None:

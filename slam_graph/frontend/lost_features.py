@@ -132,7 +132,7 @@ class LostFeatures:
         if not good:
             self._pause = 0
         paused = self._left_out < self._pause
-        if paused and self._most_missing(after) <= len(after):
+        if paused and not self._may_miss_more(after):
             self._left_out += 1
             return nothing
         sought = self._sought(after)
@@ -195,12 +195,15 @@ class LostFeatures:
             sought.append(np.flatnonzero(of_image & (past.tries < _TRIES)))
         return sought
 
-    def _most_missing(self, after: Tracks) -> int:
-        """How many corners of a past image are missing at most, in view or not."""
-        missing = [~are_among(past.tracks.ids, after.ids) for past in self._past]
-        pairs = zip(missing, self._past, strict=True)
-        counts = (np.count_nonzero(away & (past.tries < _TRIES)) for away, past in pairs)
-        return max(map(int, counts), default=0)
+    def _may_miss_more(self, after: Tracks) -> bool:
+        """Whether more corners of a past image may be sought than are followed, in view or not."""
+
+        def missing(past: _Remembered) -> int:
+            away = ~are_among(past.tracks.ids, after.ids) & (past.tries < _TRIES)
+            return int(np.count_nonzero(away))
+
+        large = (past for past in self._past if len(past.tracks) > len(after))
+        return any(missing(past) > len(after) for past in large)
 
     def _count_tries(self, ids: IntArray) -> None:
         """Note that corners are looked for, whichever image they are taken from."""
