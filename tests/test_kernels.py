@@ -38,11 +38,14 @@ from slam_graph.kernels.feature_sums import (
 from slam_graph.kernels.gate import (
     observation_distances,
     observation_distances_numpy,
+    observation_rows,
+    observation_rows_numpy,
     track_distances,
     track_distances_numpy,
 )
 from slam_graph.kernels.null_space import triangularize_features, triangularize_features_numpy
 from slam_graph.kernels.patch_search import most_similar, most_similar_numpy
+from slam_graph.kernels.pose_steps import pose_steps, pose_steps_numpy
 from slam_graph.kernels.projection import (
     chain_rule,
     chain_rule_numpy,
@@ -193,6 +196,33 @@ def test_gate(calibration: int) -> None:
     observation_distances(r, H, root, columns, found[0])
     observation_distances_numpy(r, H, root, columns, found[1])
     assert same(*found)
+
+
+def test_observation_rows() -> None:
+    rng = np.random.default_rng(11)
+    H, root = rng.normal(size=(20, 2, 9)), np.asfortranarray(np.tril(rng.normal(size=(40, 40))))
+    columns, found = rng.integers(0, 40, (20, 9)), np.empty((2, 40, 40))
+    observation_rows(H, root, columns, found[0])
+    observation_rows_numpy(H, root, columns, found[1])
+    assert same(*found)
+
+
+def test_pose_steps() -> None:
+    rng = np.random.default_rng(12)
+    points = rng.uniform([-3, -3, -1], [3, 3, 8], (60, 3))
+    rays, chosen = rng.uniform(-0.5, 0.5, (60, 2)), rng.uniform(size=60) < 0.8
+    ahead = points[:, 2] > 1.0
+    rays[ahead] = points[ahead, :2] / points[ahead, 2:] + rng.normal(0.0, 0.01, (ahead.sum(), 2))
+    found = []
+    for kernel in pose_steps, pose_steps_numpy:
+        pose, errors = np.eye(3, 4), np.empty(60)
+        pose[:, 3] = 0.05
+        kernel(points, rays, chosen, np.array([0.2, 0.1, np.inf]), pose, errors)
+        found.append((pose, errors))
+    (pose, errors), (expected, others) = found
+    assert same(pose, expected)
+    assert np.isinf(errors).any()
+    assert same(errors[np.isfinite(errors)], others[np.isfinite(others)])
 
 
 @pytest.mark.parametrize("calibration", [0, 4])

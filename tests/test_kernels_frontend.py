@@ -18,6 +18,7 @@ from slam_graph.kernels.epipolar import (
     ray_depths_numpy,
 )
 from slam_graph.kernels.halvings import halved, halvings_room
+from slam_graph.kernels.image_turn import turn_steps, turn_steps_numpy
 from slam_graph.kernels.near_pairs import near_pairs, near_pairs_numpy, nearest, nearest_numpy
 from slam_graph.kernels.patch_alignment import align_patches, align_patches_numpy
 from slam_graph.kernels.patch_templates import fill_templates, fill_templates_numpy
@@ -324,3 +325,22 @@ def test_align_patches(iterations: int) -> None:
     assert 10 < np.count_nonzero(found) < 50
     for one, other in zip(values, others, strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("steps", [0, 1, 6])
+@pytest.mark.parametrize("stride", [1, 2])
+def test_turn_steps(steps: int, stride: int) -> None:
+    noise = np.random.default_rng(12).normal(0.0, 100.0, (60, 100)).astype(np.float32)
+    scene = cv2.GaussianBlur(noise, (0, 0), 3.0)
+    one, other = (np.ascontiguousarray(scene[k : k + 50, 2 * k : 2 * k + 80]) for k in (4, 5))
+    slopes = [np.asarray(cv2.Sobel(one, -1, *d, scale=0.125)) for d in ((1, 0), (0, 1))]
+    camera = np.array([50.0, 52.0, 40.0, 25.0])
+    found = []
+    for kernel in turn_steps, turn_steps_numpy:
+        R = np.eye(3)
+        outcome = kernel(one, other, *slopes, camera, stride, steps, 1e-9, R)
+        found.append((R, *outcome))
+    for value, expected in zip(*found, strict=True):
+        np.testing.assert_allclose(value, expected, rtol=1e-12, atol=1e-12)
+    if steps == 6:  # by two pixels to the left and one upwards
+        np.testing.assert_allclose(found[0][0][:2, 2], [-2 / 50, -1 / 52], atol=0.01)

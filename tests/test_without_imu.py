@@ -312,6 +312,22 @@ def test_the_motion_is_that_of_most_points_also_where_others_are_near() -> None:
     assert np.mean(solved.fits[90:]) < 0.1
 
 
+def test_a_guess_leads_where_samples_of_points_do() -> None:
+    rng, mounted = np.random.default_rng(3), RigCamera(CAMERA, gtsam.Pose3())
+    points = rng.uniform([-3, -2, 2], [3, 2, 16], (120, 3))
+    pose = gtsam.Pose3(gtsam.Rot3.Expmap([0.01, -0.02, 0.015]), np.array([0.04, -0.02, 0.03]))
+    seen = np.asarray(pose.transformTo(points.T)).T
+    rays = seen[:, :2] / seen[:, 2:] + rng.normal(0.0, 0.3 / CAMERA.fx, (120, 2))
+    rays[:30] += 5.0 / CAMERA.fx
+    sampled = pose_of_most(mounted, points, rays)
+    for guess in gtsam.Pose3(), gtsam.Pose3(gtsam.Rot3.Expmap([0.0, 2.0, 0.0]), np.zeros(3)):
+        found = pose_of_most(mounted, points, rays, guess=guess)
+        assert found is not None
+        assert sampled is not None
+        assert found.world_T_body.equals(sampled.world_T_body, 1e-4)
+        assert found.fits[30:].all()
+
+
 def test_a_box_that_begins_to_move_does_not_pull_two_cameras() -> None:
     """It is near: it has many of the features whose depth is known, and tells the translation."""
     flight = {"duration_s": 8.0, "rate_hz": 10.0, "cameras": 2, "tracks": {"pixel_sigma": 0.5}}

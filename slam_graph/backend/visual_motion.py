@@ -125,12 +125,13 @@ class VisualMotion:
         since_ns = predicted.stamp_ns - before.stamp_ns
         if last is not None and abs(frame.stamp_ns - last.stamp_ns - since_ns) > _SAME_NS:
             last = None  # it is not that of the state before
-        points = self._known(before, last, known)
+        points = self._known(before, last, frame, known)
         # begin one limit below that of the last frame: each one that is tried costs a RANSAC
         least_px = max((px for px in _ERRORS_PX if px < self._limit_px), default=0.0)
         found = predicted
         for _ in range(_ROUNDS if self._rig.rolling else 1):
-            solved = self._pose(frame, points, self._rate(found, before), least_px)
+            rate = self._rate(found, before)
+            solved = self._pose(frame, points, rate, least_px, found.world_T_body)
             if solved is None:
                 return predicted
             self._limit_px = solved.limit_px
@@ -150,14 +151,19 @@ class VisualMotion:
         return np.asarray(gtsam.Rot3.Logmap(turn)) / ((state.stamp_ns - before.stamp_ns) * 1e-9)
 
     def _known(
-        self, before: NavState, last: FeatureFrame | None, known: tuple[IntArray, FloatArray]
+        self,
+        before: NavState,
+        last: FeatureFrame | None,
+        frame: FeatureFrame,
+        known: tuple[IntArray, FloatArray],
     ) -> KnownPoints:
-        """Known features in the world, and those of the last frame."""
+        """Known features in the world, and those of the last frame that the new one sees too."""
         ids, points = known
         located = np.ones(len(ids), np.bool_)
         if last is not None:
-            seen = depths_within(last, self._rig, self._rate(before))
-            seen = seen.subset(~np.isin(seen.ids, ids))
+            again = frame.cameras[0].ids
+            again = again[~is_in(again, np.sort(ids))]
+            seen = depths_within(last.only(again), self._rig, self._rate(before))
             world = np.asarray(before.world_T_body.transformFrom(seen.points.T)).T
             ids = np.concatenate([ids, seen.ids])
             points = np.concatenate([points, world.reshape(-1, 3)])
@@ -165,7 +171,12 @@ class VisualMotion:
         return KnownPoints(ids, points, located)
 
     def _pose(
-        self, frame: FeatureFrame, known: KnownPoints, rate: FloatArray, least_px: float
+        self,
+        frame: FeatureFrame,
+        known: KnownPoints,
+        rate: FloatArray,
+        least_px: float,
+        guess: gtsam.Pose3,
     ) -> PoseOfMost | None:
         """The pose by known points in the world; None if they do not tell it."""
         seen, mounted = frame.cameras[0], self._rig.cameras[0]
@@ -173,11 +184,15 @@ class VisualMotion:
         if np.count_nonzero(found.located) < self._min_points:
             return None
         rays = _unrolled(seen.normalized[rows], seen.pixels[rows, 1], mounted, rate)
-        return pose_of_most(mounted, found.points, rays[:, :2] / rays[:, 2:], least_px)
+        return pose_of_most(mounted, found.points, rays[:, :2] / rays[:, 2:], least_px, guess)
 
 
 def pose_of_most(
-    mounted: RigCamera, points: FloatArray, rays: FloatArray, least_px: float = 0.0
+    mounted: RigCamera,
+    points: FloatArray,
+    rays: FloatArray,
+    least_px: float = 0.0,
+    guess: gtsam.Pose3 | None = None,
 ) -> PoseOfMost | None:
     """The pose that most points agree on; None if fewer than half do.
 
@@ -186,13 +201,17 @@ def pose_of_most(
         points: (N, 3) in the world, m.
         rays: (N, 2) where it sees them, on its plane z = 1.
         least_px: smaller limits of the errors are not tried.
+        guess: a pose that may be near; samples of points are drawn where most do not agree on one
+            that is found from it.
     """
+    ways: tuple[gtsam.Pose3 | None, ...] = (None,) if guess is None else (guess, None)
     for error_px, share in zip(_ERRORS_PX, _SHARES, strict=True):
         if error_px < least_px:
             continue
-        solved = mounted.body_pose(points, rays, error_px, tightened=True)
-        if solved is not None and np.mean(solved[1]) >= share:
-            return PoseOfMost(*solved, error_px)
+        for way in ways:
+            solved = mounted.body_pose(points, rays, error_px, tightened=True, guess=way)
+            if solved is not None and np.mean(solved[1]) >= share:
+                return PoseOfMost(*solved, error_px)
     return None
 
 

@@ -9,7 +9,7 @@ from functools import partial, reduce
 import numpy as np
 from scipy.spatial.distance import cdist
 
-from slam_graph.arrays import BoolArray, FloatArray, IntArray
+from slam_graph.arrays import BoolArray, FloatArray, IntArray, median
 from slam_graph.frontend.association import Associator
 from slam_graph.frontend.epipolar_test import EpipolarTest, distances_px, fitted_motion
 from slam_graph.frontend.extraction import FeatureExtractor
@@ -89,7 +89,7 @@ class CameraTracker:
             self._predictor.advance(before.stamp_ns, stamp_ns)
             if self._rotation is not None and before.image is not None:
                 turn = self._rotation.between(before.image, image)
-                self._predictor.turn(turn)
+                self._predictor.turn(turn, self._rotation.close)
                 if self._lost is not None:
                     self._lost.turn(turn)
             guess = self._predictor.predict(before, stamp_ns, feedback)
@@ -217,7 +217,7 @@ class CameraTracker:
         """
         if self._lost is None or len(before) == 0:
             return 1.0
-        moved_px = float(np.median(np.linalg.norm(after - before, axis=1)))
+        moved_px = float(median(np.linalg.norm(after - before, axis=1)))
         return 1.0 + BLUR_PER_PX * moved_px / self._config.epipolar_px
 
     def _rigid_motions(self, before: FloatArray, after: FloatArray, scale: float) -> list[IntArray]:

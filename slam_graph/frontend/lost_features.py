@@ -25,6 +25,7 @@ from slam_graph.frontend.image_rotation import ImageRotation, SmallImage
 from slam_graph.frontend.keypoints import Pixels, Tracks
 from slam_graph.frontend.lucas_kanade import LucasKanade
 from slam_graph.frontend.outliers import MIN_POINTS
+from slam_graph.kernels.ascending import are_among
 from slam_graph.sensors import Camera
 
 _IMAGES = 8
@@ -37,7 +38,7 @@ _TRIES = 3
 """A corner is looked for in so many good images."""
 _GOOD = 0.75
 """An image is good if this part of the corners is left that there were after the one before."""
-_LONGEST_PAUSE = 16
+_LONGEST_PAUSE = 32
 """As many images are left out at most between two that are searched."""
 _FITTING = 0.7
 """Part of the corners that must fit the motion. A wrong one is on its epipolar line by chance once
@@ -130,9 +131,13 @@ class LostFeatures:
         good = len(after) >= _GOOD * self._count
         if not good:
             self._pause = 0
+        paused = self._left_out < self._pause
+        if paused and not self._may_miss_more(after):
+            self._left_out += 1
+            return nothing
         sought = self._sought(after)
         most = max(map(len, sought), default=0)
-        if self._left_out < self._pause and most <= len(after):
+        if paused and most <= len(after):
             self._left_out += 1
             return nothing
         if most < _LEAST:
@@ -181,7 +186,7 @@ class LostFeatures:
         rays = np.concatenate([_rays(past.turn, past.tracks) for past in self._past])
         ids = np.concatenate([past.tracks.ids for past in self._past])
         visible = inside(self._places(rays), after.image.shape, BORDER_PX)
-        missing = visible & ~np.isin(ids, after.ids)
+        missing = visible & ~are_among(ids, after.ids)
         ends = np.cumsum([len(past.tracks) for past in self._past])[:-1]
         parts = zip(self._past, np.split(missing, ends), strict=True)
         sought = []
@@ -189,6 +194,16 @@ class LostFeatures:
             past.forget_tries(of_image)
             sought.append(np.flatnonzero(of_image & (past.tries < _TRIES)))
         return sought
+
+    def _may_miss_more(self, after: Tracks) -> bool:
+        """Whether more corners of a past image may be sought than are followed, in view or not."""
+
+        def missing(past: _Remembered) -> int:
+            away = ~are_among(past.tracks.ids, after.ids) & (past.tries < _TRIES)
+            return int(np.count_nonzero(away))
+
+        large = (past for past in self._past if len(past.tracks) > len(after))
+        return any(missing(past) > len(after) for past in large)
 
     def _count_tries(self, ids: IntArray) -> None:
         """Note that corners are looked for, whichever image they are taken from."""
@@ -199,7 +214,7 @@ class LostFeatures:
         """Where rays (N, 3) of the camera hit the image (N, 2); far outside of it if behind."""
         ahead = rays[:, 2] > 0.2
         places = np.full((len(rays), 2), -1e3)
-        places[ahead] = self._camera.distort(rays[ahead, :2] / rays[ahead, 2:])[0]
+        places[ahead] = self._camera.pixels(rays[ahead, :2] / rays[ahead, 2:])
         return places.astype(np.float32)
 
 

@@ -114,8 +114,8 @@ class Prediction:
 
     Attributes:
         points: (N, 2) float32 pixels.
-        trusted: (N,) whether the prediction is good to a few pixels: the rotation was measured and
-            the residual flow is known, or the feature is in the map.
+        trusted: (N,) whether the prediction is good to a few pixels: the rotation was measured, by
+            a gyroscope or by images, and the residual flow is known, or the feature is in the map.
     """
 
     points: Pixels
@@ -143,6 +143,7 @@ class PointPredictor:
         self._mode = config.prediction
         self.camera_R: FloatArray = np.eye(3)
         self.rotation_known = False
+        self._turn_known = False  # by images
 
     def mount(self, mounted: RigCamera) -> None:
         """Take the place and the clock of the camera as they are calibrated now."""
@@ -158,14 +159,19 @@ class PointPredictor:
         if not self._mounted.rotation_known:  # the gyroscope tells nothing of the camera
             start_R_end = None
         self.rotation_known = start_R_end is not None and self._mode != "flow"
+        self._turn_known = False
         self.camera_R = np.eye(3)
         if start_R_end is not None:
             body_R_camera = self._body_T_camera.rotation().matrix()
             self.camera_R = body_R_camera.T @ start_R_end.matrix().T @ body_R_camera
 
-    def turn(self, end_R_start: FloatArray) -> None:
-        """Take a rotation (3, 3) of the camera over two frames that the gyroscope did not give."""
-        self.camera_R = end_R_start
+    def turn(self, end_R_start: FloatArray, close: bool) -> None:
+        """Take a rotation (3, 3) of the camera over two frames that the gyroscope did not give.
+
+        If it is `close`, to a few pixels, features are looked for near where it puts them; to test
+        their tracks by it that is not enough.
+        """
+        self.camera_R, self._turn_known = end_R_start, close
 
     def predict(self, before: Tracks, stamp_ns: int, feedback: Feedback) -> Prediction:
         """Where to look for the features of the image before.
@@ -178,7 +184,7 @@ class PointPredictor:
         if self._mode == "none" or len(before) == 0:
             return Prediction(before.pixels, np.zeros(len(before), np.bool_))
         flow, seconds = before.residual_flow, (stamp_ns - before.stamp_ns) * 1e-9
-        trusted: BoolArray = np.isfinite(flow[:, 0]) & self.rotation_known
+        trusted: BoolArray = np.isfinite(flow[:, 0]) & (self.rotation_known | self._turn_known)
         start = self.unrolled(before.pixels, before.normalized, before.stamp_ns)
         m = self._rotated(start) + np.where(np.isnan(flow), 0.0, flow) * seconds
         if self._mode == "state":

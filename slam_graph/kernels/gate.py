@@ -14,6 +14,8 @@ from slam_graph.kernels.compilation import compiled
 __all__ = [
     "observation_distances",
     "observation_distances_numpy",
+    "observation_rows",
+    "observation_rows_numpy",
     "track_distances",
     "track_distances_numpy",
 ]
@@ -59,6 +61,35 @@ def observation_distances_numpy(
     y = H @ root.T[columns]
     S = y @ y.transpose(0, 2, 1) + np.eye(2)
     distances[:] = np.einsum("ni,ni->n", r, np.linalg.solve(S, r[:, :, None])[:, :, 0])
+
+
+@compiled("void(f8[:, :, ::1], f8[::1, :], i8[:, ::1], f8[:, ::1])")
+def observation_rows(H: FloatArray, root: FloatArray, columns: IntArray, rows: FloatArray) -> None:
+    """Derivatives H rootᵀ of single observations by whitened variables x, δ = rootᵀ x.
+
+    Args:
+        H: (N, 2, k) by variables.
+        root: (m, n) lower triangular, with P = rootᵀ root the covariance of the variables.
+        columns: (N, k) columns of `root` that go with those of H.
+        rows: (2 N, m), filled.
+    """
+    for n in range(len(H)):
+        one, other = rows[2 * n], rows[2 * n + 1]
+        one[:], other[:] = 0.0, 0.0
+        for k in range(columns.shape[1]):
+            first = columns[n, k]
+            column = root[:, first]
+            a, b = H[n, 0, k], H[n, 1, k]
+            for i in range(first, len(column)):
+                one[i] += a * column[i]
+                other[i] += b * column[i]
+
+
+def observation_rows_numpy(
+    H: FloatArray, root: FloatArray, columns: IntArray, rows: FloatArray
+) -> None:
+    """`observation_rows` in NumPy."""
+    rows[:] = (H @ np.tril(root).T[columns]).reshape(rows.shape)
 
 
 @compiled()

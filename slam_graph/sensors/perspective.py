@@ -1,6 +1,9 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""The pose of a camera by points that it sees: PnP with RANSAC (OpenCV), the same for all."""
+"""The pose of a camera by points that it sees.
+
+By PnP with RANSAC (OpenCV), or by steps from a pose that is nearly right.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +12,7 @@ import gtsam
 import numpy as np
 from cv2.typing import MatLike
 
-from slam_graph.arrays import BoolArray, FloatArray
+from slam_graph.arrays import BoolArray, FloatArray, median
 
 RANSAC_ITERATIONS = 200
 _CONFIDENCE = 0.999
@@ -19,6 +22,12 @@ _MAX_MEDIANS = 2.1
 """Largest error of these, in medians: 95 % of two-dimensional normal errors are smaller."""
 _FEWEST = 6
 """Fewer points are no better choice."""
+
+_SCALES = np.array([16.0, 8.0, 4.0, 2.0])
+"""Of a robust loss, in errors of points that fit: with each step from a guess more errors count as
+outliers."""
+_LAST_STEPS = np.full(2, np.inf)
+"""Steps over the points that fit, without a loss."""
 
 
 def camera_pose(
@@ -70,6 +79,40 @@ def camera_pose(
         )
     pose = gtsam.Pose3(gtsam.Rot3(cv2.Rodrigues(rotation)[0]), translation[:, 0])
     return pose, _errors(points, rays, rotation, translation) < error
+
+
+def pose_from_guess(
+    points: FloatArray, rays: FloatArray, error: float, guess: gtsam.Pose3, least: int = _FEWEST
+) -> tuple[gtsam.Pose3, BoolArray] | None:
+    """camera_T_points as `camera_pose` with `tightened` finds it, from a pose that is nearly right.
+
+    Gauss-Newton steps under a loss that narrows, so that no samples are drawn. From a guess that is
+    not good enough few points fit in the end.
+
+    Args:
+        points: (N, 3) m.
+        rays: (N, 2) where the camera sees them, on its plane z = 1.
+        error: largest error on that plane of a point that fits.
+        guess: camera_T_points.
+        least: how many points must fit.
+
+    Returns:
+        The pose, and (N,) which points are in front of the camera and fit; None without a pose.
+    """
+    from slam_graph.kernels.pose_steps import pose_steps  # which loads kernels
+
+    points, rays = np.ascontiguousarray(points), np.ascontiguousarray(rays)
+    pose, errors = np.ascontiguousarray(guess.matrix()[:3]), np.empty(len(points))
+    pose_steps(points, rays, np.ones(len(points), np.bool_), error * _SCALES, pose, errors)
+    for _ in range(_TIGHTENED):
+        fitting = errors[errors < error]
+        if len(fitting) < least:
+            return None
+        chosen = errors < min(error, _MAX_MEDIANS * float(median(fitting)))
+        pose_steps(points, rays, chosen, _LAST_STEPS, pose, errors)
+    if not np.isfinite(pose).all():
+        return None
+    return gtsam.Pose3(gtsam.Rot3(pose[:, :3]), pose[:, 3]), errors < error
 
 
 def _errors(

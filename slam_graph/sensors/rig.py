@@ -18,7 +18,7 @@ from slam_graph.arrays import BoolArray, FloatArray
 from slam_graph.errors import DataError
 from slam_graph.sensors.camera import Camera
 from slam_graph.sensors.depth import DepthSensor
-from slam_graph.sensors.perspective import camera_pose
+from slam_graph.sensors.perspective import camera_pose, pose_from_guess
 
 _STAMPED_ROWS = {"first": 0.0, "middle": 0.5, "last": 1.0}
 """Rows of a rolling shutter that a stamp may be the time of, as parts of the height."""
@@ -108,8 +108,11 @@ class RigCamera:
         error_px: float,
         least: int = 4,
         tightened: bool = False,
+        guess: gtsam.Pose3 | None = None,
     ) -> tuple[gtsam.Pose3, BoolArray] | None:
-        """world_T_body by points that this camera sees (PnP with RANSAC), and which of them fit it.
+        """world_T_body by points that this camera sees, and which of them fit it.
+
+        By PnP with RANSAC, or from a guess.
 
         Args:
             points: (N, 3) in the world, m.
@@ -117,12 +120,18 @@ class RigCamera:
             error_px: largest error of a point that fits.
             least: how many points must fit.
             tightened: see `camera_pose`.
+            guess: world_T_body nearby; see `pose_from_guess`.
 
         Returns:
             The pose, and (N,) which points are in front of the camera and fit; None without a pose.
         """
         focal_px = float(np.sqrt(self.camera.fx * self.camera.fy))
-        found = camera_pose(points, rays, error_px / focal_px, least, tightened)
+        error = error_px / focal_px
+        if guess is None:
+            found = camera_pose(points, rays, error, least, tightened)
+        else:
+            camera_T_world = guess.compose(self.body_T_camera).inverse()
+            found = pose_from_guess(points, rays, error, camera_T_world, least)
         if found is None:
             return None
         camera_T_world, fits = found

@@ -14,17 +14,27 @@ that a pose which follows them fits nearly all of the farther ones too, if these
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
-from slam_graph.arrays import BoolArray, FloatArray
+from slam_graph.arrays import BoolArray, FloatArray, median
 from slam_graph.backend.cost.cost import Cost, Linearization
 from slam_graph.backend.cost.feature_factors import WhitenedObservations, sum_features
-from slam_graph.backend.cost.gating import Gate
+from slam_graph.backend.cost.gating import (
+    Gate,
+    distances_of_tracks,
+    squared_mahalanobis,
+    threshold,
+)
 from slam_graph.backend.cost.measurement_rows import columns_of_state
 from slam_graph.backend.cost.robust_loss import MEDIAN_2D, WIDTH_2D
+from slam_graph.backend.cost.whitened_update import TailRoot, WhitenedUpdate
 from slam_graph.backend.solve.square_root import SquareRootInformation
+from slam_graph.backend.solve.state import POINT_DIM
+from slam_graph.kernels.gate import observation_rows
 
 _FEWEST, _LEAST_SHARE = 10, 0.5
 """Where fewer features fit, or a smaller part of all, there is no consensus. Counted before the
@@ -65,38 +75,83 @@ def gate_by_consensus(
     consensus = _consensus(cost, linear)
     if consensus is None:
         return cost.gate(linear, predicted, tested)
+    columns = _Columns.of(cost, linear, predicted)
+    root = TailRoot.of(predicted, columns.first)
     try:
-        second = _second_gate(cost, linear, predicted, consensus, tested)
-    except np.linalg.LinAlgError:  # they do not determine the step
+        update = WhitenedUpdate(predicted, root, *_rows(cost, linear, columns, root, consensus))
+    except np.linalg.LinAlgError:
         return cost.gate(linear, predicted, tested)
-    landmarks, tracks = consensus.landmarks.copy(), consensus.tracks | second.tracks
-    landmarks[~landmarks] = second.landmarks
+    after = _after(cost, linear, update.solution(), columns)
+    landmarks = consensus.landmarks | _landmarks_pass(after, update, columns)
+    others = ~consensus.tracks if tested is None else tested & ~consensus.tracks
+    tracks = consensus.tracks | _tracks_pass(cost, after, update, columns, others)
     admitted = landmarks, tracks if tested is None else tracks[tested]
-    return cost.gate(linear, predicted, tested, admitted=admitted)
+    return cost.gate(linear, predicted, tested, admitted=admitted, root=root)
 
 
-def _second_gate(
-    cost: Cost,
-    linear: Linearization,
-    predicted: SquareRootInformation,
-    consensus: _Consensus,
-    tested: BoolArray | None,
-) -> Gate:
-    """The gate of all others against what is known with the consensus.
+@dataclass(frozen=True, slots=True, eq=False)
+class _Columns:
+    """Which columns observations have.
 
-    Returns:
-        Of the observations of features of the state only those that are not of the consensus.
+    Attributes:
+        landmarks: (N, 9 + C) of observations of features of the state.
+        poses: (6 F + C,) of poses and calibration of new features.
+        first: the first of all.
     """
-    posterior = predicted
-    for rows in _rows(cost, linear, predicted, consensus):
-        posterior = posterior.updated(rows)
-    others = replace(cost)
-    if linear.landmarks is not None and cost.landmarks is not None:
-        others.landmarks = cost.landmarks.rows(~consensus.landmarks)
-        linear = replace(linear, landmarks=linear.landmarks.subset(~consensus.landmarks))
-    after = _after(others, linear, posterior.solution(), predicted)
-    new = ~consensus.tracks if tested is None else tested & ~consensus.tracks
-    return others.gate(after, posterior, new, _CONFIDENCE)
+
+    landmarks: NDArray[np.intp]
+    poses: NDArray[np.intp]
+    first: int
+
+    @staticmethod
+    def of(cost: Cost, linear: Linearization, predicted: SquareRootInformation) -> _Columns:
+        """Those of a cost."""
+        layout = predicted.layout
+        landmarks, poses = np.zeros((0, 9), np.intp), np.zeros(0, np.intp)
+        if linear.landmarks is not None and cost.landmarks is not None:
+            landmarks = columns_of_state(cost.landmarks, layout, cost.rig.common_keys)
+        if linear.tracks is not None and cost.tracks is not None:
+            poses = layout.indices(cost.rig.keys_of(cost.tracks.obs))
+        first = min(int(part.min(initial=layout.size)) for part in (landmarks, poses))
+        return _Columns(landmarks, poses, first)
+
+
+def _landmarks_pass(after: Linearization, update: WhitenedUpdate, columns: _Columns) -> BoolArray:
+    """Which observations (N,) of features of the state fit what is known with the consensus.
+
+    The distance of a residual is at most its square. Only for what is larger than the limit the
+    covariance is wanted.
+    """
+    if after.landmarks is None:
+        return np.zeros(0, np.bool_)
+    r, H = after.landmarks.r, after.landmarks.H
+    limit = threshold(np.array([2]), _CONFIDENCE)[0]
+    passed: BoolArray = np.einsum("ni,ni->n", r, r) < limit
+    large = (~passed).nonzero()[0]
+    if len(large):
+        used, places = np.unique(columns.landmarks[large], return_inverse=True)
+        places = places.reshape(len(large), -1)
+        P = update.covariance(used)[places[:, :, None], places[:, None, :]]
+        passed[large] = squared_mahalanobis(r[large], H[large], P) < limit
+    return passed
+
+
+def _tracks_pass(
+    cost: Cost, after: Linearization, update: WhitenedUpdate, columns: _Columns, tested: BoolArray
+) -> BoolArray:
+    """Which new features (J,) fit what is known with the consensus, of those that are tested."""
+    if after.tracks is None or cost.tracks is None:
+        return tested
+    assert isinstance(after.tracks, WhitenedObservations)
+    obs, squares = cost.tracks.obs, np.einsum("ni,ni->n", after.tracks.r, after.tracks.r)
+    limits = threshold(2 * obs.counts - POINT_DIM, _CONFIDENCE)
+    large = tested & (np.add.reduceat(squares, obs.starts[:-1]) >= limits)
+    passed = tested & ~large
+    if large.any():
+        linear = after.tracks.subset(large[obs.feature])
+        distances = distances_of_tracks(obs.subset(large), linear, update.covariance(columns.poses))
+        passed[large] = distances < limits[large]
+    return passed
 
 
 def _consensus(cost: Cost, linear: Linearization) -> _Consensus | None:
@@ -110,13 +165,14 @@ def _consensus(cost: Cost, linear: Linearization) -> _Consensus | None:
     errors = linear.errors[np.isfinite(linear.errors)]
     if not len(errors):
         return None
-    limit = WIDTH_2D / MEDIAN_2D * float(np.median(errors))
+    limit = WIDTH_2D / MEDIAN_2D * float(median(errors))
     worst, depths = _of_features(cost, linear)
     # nearer or behind, the slope of the projection tells nothing
     fits = (worst < limit) & (depths >= cost.config.triangulation.min_depth_m)
     if np.sum(fits) < max(_FEWEST, _LEAST_SHARE * len(fits)):
         return None
-    fits &= depths >= np.quantile(depths[fits], _NEAREST)
+    ascending = np.sort(depths[fits])
+    fits &= depths >= ascending[math.ceil(_NEAREST * (len(ascending) - 1))]
     count = 0 if linear.landmarks is None else len(linear.landmarks.errors)
     return _Consensus(fits[:count], fits[count:])
 
@@ -136,40 +192,40 @@ def _of_features(cost: Cost, linear: Linearization) -> tuple[FloatArray, FloatAr
 
 
 def _rows(
-    cost: Cost, linear: Linearization, predicted: SquareRootInformation, consensus: _Consensus
-) -> list[FloatArray]:
-    """Rows [A b] (m, n + 1) of the consensus; new features say what they say of poses."""
-    part = replace(cost, landmarks=None, tracks=None)
-    landmarks = summed = None
-    if linear.landmarks is not None and cost.landmarks is not None:
-        part.landmarks = cost.landmarks.rows(consensus.landmarks)
-        landmarks = linear.landmarks.subset(consensus.landmarks)
+    cost: Cost, linear: Linearization, columns: _Columns, root: TailRoot, consensus: _Consensus
+) -> tuple[FloatArray, FloatArray]:
+    """Rows [Y b] of the consensus by whitened variables; new features say what they do of poses."""
+    Y, b = [np.zeros((0, len(root.W)))], [np.zeros(0)]
+    if linear.landmarks is not None:
+        chosen = linear.landmarks.subset(consensus.landmarks)
+        Y.append(np.empty((2 * len(chosen.r), len(root.W))))
+        own = columns.landmarks[consensus.landmarks] - root.first
+        observation_rows(chosen.H, np.asfortranarray(root.W), own, Y[-1])
+        b.append(chosen.r.ravel())
     if linear.tracks is not None and cost.tracks is not None and consensus.tracks.any():
         assert isinstance(linear.tracks, WhitenedObservations)
-        chosen = cost.tracks.subset(consensus.tracks)
-        part.tracks = replace(chosen, in_state=np.zeros(len(chosen.points), np.bool_))
         observed = linear.tracks.subset(consensus.tracks[cost.tracks.obs.feature])
-        summed = sum_features(part.tracks.obs, observed)
-    return part.rows(Linearization(landmarks, summed, linear.errors), predicted.layout)
+        rows = sum_features(cost.tracks.obs.subset(consensus.tracks), observed).rows
+        Y.append(rows[:, :-1] @ root.columns(columns.poses).T)
+        b.append(rows[:, -1])
+    return np.concatenate(Y), np.concatenate(b)
 
 
 def _after(
-    cost: Cost, linear: Linearization, moved: FloatArray, predicted: SquareRootInformation
+    cost: Cost, linear: Linearization, moved: FloatArray, columns: _Columns
 ) -> Linearization:
     """The linearisation with the residuals after an increment (n,) of the variables.
 
     Those of new features are after it of poses and calibration; the gate eliminates their points.
     """
     landmarks, tracks = linear.landmarks, linear.tracks
-    if landmarks is not None and cost.landmarks is not None:
-        along = moved[columns_of_state(cost.landmarks, predicted.layout, cost.rig.common_keys)]
-        r = landmarks.r - np.einsum("nij,nj->ni", landmarks.H, along)
+    if landmarks is not None:
+        r = landmarks.r - np.einsum("nij,nj->ni", landmarks.H, moved[columns.landmarks])
         landmarks = replace(landmarks, r=r)
     if tracks is not None and cost.tracks is not None:
         assert isinstance(tracks, WhitenedObservations)
         obs = cost.tracks.obs
-        along = moved[predicted.layout.indices(cost.rig.keys_of(obs))]
-        poses, common = np.split(along, [6 * len(obs.frames)])
+        poses, common = np.split(moved[columns.poses], [6 * len(obs.frames)])
         r = tracks.r - np.einsum("nij,nj->ni", tracks.by_pose, poses.reshape(-1, 6)[obs.frame])
         tracks = replace(tracks, r=r - tracks.by_calibration @ common)
     return Linearization(landmarks, tracks, linear.errors)

@@ -41,6 +41,7 @@ from slam_graph.backend.cost.measurement_rows import (
 from slam_graph.backend.cost.reprojection import Geometry, RigProjection
 from slam_graph.backend.cost.robust_loss import RobustLoss
 from slam_graph.backend.cost.triangulation import first_centres, moved_in_inverse_depth
+from slam_graph.backend.cost.whitened_update import TailRoot
 from slam_graph.backend.solve.square_root import Layout, SquareRootInformation
 from slam_graph.backend.solve.state import POINT_DIM, State, dims_of, landmark_keys
 
@@ -334,8 +335,8 @@ class Cost:
         linear: Linearization,
         predicted: SquareRootInformation,
         tested: BoolArray | None = None,
-        confidence: float | None = None,
         admitted: tuple[BoolArray | bool, BoolArray | bool] = (True, True),
+        root: TailRoot | None = None,
     ) -> Gate:
         """Which tracked observations and new features pass the χ² test.
 
@@ -344,12 +345,11 @@ class Cost:
                 residuals any would pass (`Linearization.unweighted`).
             predicted: what is known of the variables before these measurements.
             tested: (J,) which of the new features are tested; all of them if it is not given.
-            confidence: share of good ones that pass; that of the settings if it is not given.
             admitted: which observations (N,) and which of the tested features may pass; else all.
+            root: of the covariance of what they depend on, if it is known.
         """
-        landmarks = np.zeros(0, np.bool_)
-        tracks = np.zeros(0, np.bool_)
-        innovations, confidence = Innovations(), confidence or self.config.gating.confidence
+        landmarks = tracks = np.zeros(0, np.bool_)
+        innovations, confidence = Innovations(), self.config.gating.confidence
         obs = None if self.tracks is None or linear.tracks is None else self.tracks.obs
         if obs is not None and tested is not None:  # they are new: few poses have seen them
             obs, tracks = obs.subset(tested).without_idle_frames(), np.zeros(len(tested), np.bool_)
@@ -357,9 +357,9 @@ class Cost:
         first = min(int(part.min(initial=predicted.layout.size)) for part in (columns, of_poses))
         if first == predicted.layout.size:  # no observations
             return Gate(landmarks, tracks, innovations)
-        root = predicted.root_from(first)
+        W = predicted.root_from(first) if root is None else root.from_column(first)
         if linear.landmarks is not None and self.landmarks is not None:
-            distance = distances_of_observations(linear.landmarks, root, columns - first)
+            distance = distances_of_observations(linear.landmarks, W, columns - first)
             dof = np.full(len(distance), 2)
             largest = threshold(dof, confidence)
             # nearer or behind, the slope of the projection is so large that any residual would pass
@@ -367,12 +367,12 @@ class Cost:
             landmarks = (distance < largest) & ~near & admitted[0]
             innovations += Innovations.of(distance, dof, largest, landmarks)
         if obs is not None and len(obs) and self.tracks is not None:
-            assert isinstance(linear.tracks, WhitenedObservations), "these are not told apart"
             observations = linear.tracks
+            assert isinstance(observations, WhitenedObservations), "these are not told apart"
             if tested is not None:
                 observations = observations.subset(tested[self.tracks.obs.feature])
-            above = int(of_poses.min()) - first  # rows that are zero there: the root is triangular
-            root_of_poses = root[above:, of_poses - first]
+            above = int(of_poses.min()) - first  # rows before are zero: the root is triangular
+            root_of_poses = W[above:, of_poses - first]
             covariance = root_of_poses.T @ root_of_poses
             distance = distances_of_tracks(obs, observations, covariance)
             dof = 2 * obs.counts - POINT_DIM

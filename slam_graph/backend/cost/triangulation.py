@@ -18,7 +18,7 @@ import numpy as np
 
 from slam_graph.arrays import BoolArray, FloatArray, IntArray
 from slam_graph.backend.backend_config import TriangulationConfig
-from slam_graph.backend.cost.feature_tracks import FeatureTracks, Observations
+from slam_graph.backend.cost.feature_tracks import Observations, is_in
 from slam_graph.backend.cost.reprojection import Geometry, RigProjection
 from slam_graph.backend.solve.state import State
 from slam_graph.kernels.ray_triangulation import triangulate_rays
@@ -127,25 +127,41 @@ def triangulate_frames(
         One row for each id; features with fewer than two observations are not good, and their
         point is NaN.
     """
-    window = FeatureTracks()
-    for index, frame in enumerate(frames):
-        window.add(index, frame)
     ascending = np.unique(ids)
-    obs = window.observations(ascending)
+    obs = _observations(ascending, frames)
     seen = obs.counts >= 2
     obs = obs.subset(seen)
     points = np.full((len(ascending), 3), np.nan)
     good = np.zeros(len(ascending), np.bool_)
     reprojection_px, depth_error = np.full((2, len(ascending)), np.inf)
     if len(obs):
-        used = list(obs.frames)
-        found = triangulate(
-            obs, RigProjection(rig), rotations[used], positions[used], TriangulationConfig()
-        )
+        found = triangulate(obs, RigProjection(rig), rotations, positions, TriangulationConfig())
         points[seen], good[seen] = found.points, found.good
         reprojection_px[seen], depth_error[seen] = found.reprojection_px, found.depth_error
     place = np.searchsorted(ascending, ids)
     return Triangulation(points[place], good[place], reprojection_px[place], depth_error[place])
+
+
+def _observations(ids: IntArray, frames: Sequence[FeatureFrame]) -> Observations:
+    """All observations of features (ascending ids) in some frames, in the order of time."""
+    views = [
+        (frame, camera, seen)
+        for frame, of_frame in enumerate(frames)
+        for camera, seen in enumerate(of_frame.cameras)
+    ]
+    sizes = [len(seen) for _, _, seen in views]
+    numbers = np.repeat([view[:2] for view in views], sizes, axis=0)
+    found = np.concatenate([seen.ids for _, _, seen in views])
+    order = found.argsort(kind="stable")
+    rows = order[is_in(found[order], ids)]
+    places = (
+        np.concatenate([seen.pixels for _, _, seen in views]),
+        np.concatenate([seen.normalized for _, _, seen in views]),
+    )
+    feature, (frame, camera) = ids.searchsorted(found[rows]), numbers[rows].T
+    every = tuple(range(len(frames)))
+    pixels, normalized = (values.take(rows, axis=0) for values in places)
+    return Observations(ids, every, feature, frame, camera, pixels, normalized)
 
 
 def first_centres(obs: Observations, rig: RigProjection, state: State) -> FloatArray:
