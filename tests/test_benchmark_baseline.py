@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks import baseline, documents, report, tables
+from benchmarks import baseline, report, tables
 from benchmarks.metric import COMPUTING_TIMES, Metric, info
 from benchmarks.recordings import CHOSEN_ON, HELD_OUT, is_held_out
 from benchmarks.registry import BENCHMARKS
@@ -104,13 +104,13 @@ def test_the_tables_of_the_documents_are_those_of_the_baseline() -> None:
     pages = [page.read_text(encoding="utf-8") for page in tables.documents()]
     shown = [found["name"] for page in pages for found in tables.MARKED.finditer(page)]
     once = "each table is in one document, that of the README also in the site's results"
-    assert sorted(shown) == sorted([*documents.TABLES, "results"]), once
+    assert sorted(shown) == sorted([*tables.TABLES, "results"]), once
     marks = sum(page.count("<!-- table:") for page in pages)
     assert marks == len(shown), "each begin has its end"
 
 
 def test_a_table_says_what_the_baseline_lacks(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(documents.TABLES, "small", lambda figures: iter([figures("a.x", 2)]))
+    monkeypatch.setitem(tables.TABLES, "small", lambda figures: iter([figures("a.x", 2)]))
     page = "before\n<!-- table: small -->\nold\n<!-- end -->\nafter\n"
     known = recorded(Metric("a.x", 1.234, "m", "lower"))
     expected = "before\n<!-- table: small -->\n1.23\n<!-- end -->\nafter\n"
