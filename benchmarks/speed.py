@@ -38,7 +38,7 @@ COST_BARS = {
 }
 """Of `cost_mean`, by algorithm and number of cameras; 2.8 is that of OpenVINS with two."""
 PROFILED = "msckf"
-"""Whose functions are told."""
+"""Whose longest functions are listed."""
 OVERLAPPED, OVERLAP_BAR = "msckf", 2.8
 """What is run with front and back end in two processes, and the bar of the time of a frame."""
 

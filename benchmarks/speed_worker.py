@@ -21,6 +21,7 @@ from typing import Any
 
 from threadpoolctl import threadpool_limits
 
+import slam_graph
 from benchmarks.clocks import Image, Watch, hold_to_one_core, time_flow
 from slam_graph.config import RunConfig, load_config
 from slam_graph.datasets.dataset_registry import open_dataset
@@ -91,7 +92,7 @@ def profiled(recording: Path, config: RunConfig) -> Table:
     result.check()
     rows = [
         (name_of(*function), calls, own_s)
-        for function, (calls, _, own_s, _, _) in Stats(profile).stats.items()  # type: ignore[attr-defined]
+        for function, (_, calls, own_s, _, _) in Stats(profile).stats.items()  # type: ignore[attr-defined]
     ]
     rows = [row for row in rows if row[0] != DECODING]
     total_s, frames = sum(own_s for *_, own_s in rows), result.logs.frames
@@ -100,18 +101,20 @@ def profiled(recording: Path, config: RunConfig) -> Table:
 
 
 LONGEST = 10
-"""How many functions of a profile are told."""
+"""How many functions of a profile are listed."""
 
 DECODING = "imdecode"
+
+PACKAGE = Path(slam_graph.__file__).parent
 
 
 def name_of(file: str, line: int, function: str) -> str:
     """A function of a profile as a reader finds it: its file in the package, or what made it."""
     if file == "~":  # compiled: <imdecode>, <built-in method numpy.zeros>
         words = function.strip("<>").removeprefix("built-in method ")
-        return re.sub(r"^slam_graph_kernels_\d\.", "kernel ", words)
-    _, _, inside = file.rpartition("/slam_graph/")
-    return f"{inside or Path(file).name}: {function}"
+        return re.sub(r"^slam_graph_kernels_\d+\.", "kernel ", words)
+    inside = Path(file).is_relative_to(PACKAGE)
+    return f"{Path(file).relative_to(PACKAGE) if inside else Path(file).name}: {function}"
 
 
 class DecodedInTurn(EurocSequence):

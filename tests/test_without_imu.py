@@ -37,6 +37,7 @@ from slam_graph.sensors import (
     Rig,
     RigCamera,
 )
+from slam_graph.sensors import rig as sensors_rig
 from slam_graph.simulation import simulate
 from slam_graph.simulation.simulated_sequence import SimulatedSequence
 
@@ -312,7 +313,8 @@ def test_the_motion_is_that_of_most_points_also_where_others_are_near() -> None:
     assert np.mean(solved.fits[90:]) < 0.1
 
 
-def test_a_guess_leads_where_samples_of_points_do() -> None:
+def test_a_guess_leads_where_samples_of_points_do(monkeypatch: pytest.MonkeyPatch) -> None:
+    """From one that is near no samples are drawn; from one that is not they still are."""
     rng, mounted = np.random.default_rng(3), RigCamera(CAMERA, gtsam.Pose3())
     points = rng.uniform([-3, -2, 2], [3, 2, 16], (120, 3))
     pose = gtsam.Pose3(gtsam.Rot3.Expmap([0.01, -0.02, 0.015]), np.array([0.04, -0.02, 0.03]))
@@ -320,12 +322,17 @@ def test_a_guess_leads_where_samples_of_points_do() -> None:
     rays = seen[:, :2] / seen[:, 2:] + rng.normal(0.0, 0.3 / CAMERA.fx, (120, 2))
     rays[:30] += 5.0 / CAMERA.fx
     sampled = pose_of_most(mounted, points, rays)
-    for guess in gtsam.Pose3(), gtsam.Pose3(gtsam.Rot3.Expmap([0.0, 2.0, 0.0]), np.zeros(3)):
+    draws = []
+    drawn = sensors_rig.camera_pose
+    monkeypatch.setattr(sensors_rig, "camera_pose", lambda *a: draws.append(a) or drawn(*a))
+    far = gtsam.Pose3(gtsam.Rot3.Expmap([0.0, 2.0, 0.0]), np.zeros(3))
+    for guess, draws_samples in (gtsam.Pose3(), False), (far, True):
         found = pose_of_most(mounted, points, rays, guess=guess)
         assert found is not None
         assert sampled is not None
         assert found.world_T_body.equals(sampled.world_T_body, 1e-4)
         assert found.fits[30:].all()
+        assert bool(draws) == draws_samples
 
 
 def test_a_box_that_begins_to_move_does_not_pull_two_cameras() -> None:

@@ -45,7 +45,7 @@ _MORE_FEATURES, _MORE_WITH_DEPTH = 1.25, 2.5
 points less exactly than a filter can linearise, so more features make it too sure: on simulated
 flights of `msckf` the NEES of position and orientation is 4.6 and 4.1 with 60 features (1.5 times)
 and 3.7 and 3.5 with 50, where 4.16 is the bar. With 100 the NEES of position is twice as large as
-with 40. With 40 a box that begins to move pulls the pose by 0.09 and 0.25 m in two of 13
+with 40. With 40 a box that begins to move pulls the pose by 0.04, 0.09 and 0.25 m in three of 13
 flights."""
 
 

@@ -126,7 +126,7 @@ class VisualMotion:
         if last is not None and abs(frame.stamp_ns - last.stamp_ns - since_ns) > _SAME_NS:
             last = None  # it is not that of the state before
         points = self._known(before, last, frame, known)
-        # begin one limit below that of the last frame: each one that is tried costs a RANSAC
+        # begin one limit below that of the last frame: each one that is tried may cost a RANSAC
         least_px = max((px for px in _ERRORS_PX if px < self._limit_px), default=0.0)
         found = predicted
         for _ in range(_ROUNDS if self._rig.rolling else 1):

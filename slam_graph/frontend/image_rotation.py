@@ -97,7 +97,7 @@ class ImageRotation:
             return self._last[1]
         reduced: cv2.typing.MatLike = image
         while reduced.shape[1] >= 2 * _WIDTH:  # halving is ten times as fast as any other factor
-            half = reduced.shape[1] // 2, reduced.shape[0] // 2
+            half = reduced.shape[1] // 2, max(1, reduced.shape[0] // 2)
             reduced = cv2.resize(reduced, half, interpolation=cv2.INTER_AREA)
         reduced = cv2.resize(reduced, self._size, interpolation=cv2.INTER_AREA)
         small = cv2.GaussianBlur(reduced.astype(np.float32), (0, 0), _BLUR)

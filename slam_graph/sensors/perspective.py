@@ -82,7 +82,7 @@ def camera_pose(
 
 
 def pose_from_guess(
-    points: FloatArray, rays: FloatArray, error: float, guess: gtsam.Pose3, least: int = _FEWEST
+    points: FloatArray, rays: FloatArray, error: float, guess: gtsam.Pose3, least: int = 4
 ) -> tuple[gtsam.Pose3, BoolArray] | None:
     """camera_T_points as `camera_pose` with `tightened` finds it, from a pose that is nearly right.
 
@@ -109,6 +109,8 @@ def pose_from_guess(
         if len(fitting) < least:
             return None
         chosen = errors < min(error, _MAX_MEDIANS * float(median(fitting)))
+        if np.count_nonzero(chosen) < _FEWEST:
+            break
         pose_steps(points, rays, chosen, _LAST_STEPS, pose, errors)
     if not np.isfinite(pose).all():
         return None

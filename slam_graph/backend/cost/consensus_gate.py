@@ -194,7 +194,7 @@ def _of_features(cost: Cost, linear: Linearization) -> tuple[FloatArray, FloatAr
 def _rows(
     cost: Cost, linear: Linearization, columns: _Columns, root: TailRoot, consensus: _Consensus
 ) -> tuple[FloatArray, FloatArray]:
-    """Rows [Y b] of the consensus by whitened variables; new features say what they do of poses."""
+    """Rows [Y b] of the consensus by whitened variables, of new features those of the poses."""
     Y, b = [np.zeros((0, len(root.W)))], [np.zeros(0)]
     if linear.landmarks is not None:
         chosen = linear.landmarks.subset(consensus.landmarks)

@@ -150,13 +150,13 @@ def _observations(ids: IntArray, frames: Sequence[FeatureFrame]) -> Observations
         for camera, seen in enumerate(of_frame.cameras)
     ]
     sizes = [len(seen) for _, _, seen in views]
-    numbers = np.repeat([view[:2] for view in views], sizes, axis=0)
-    found = np.concatenate([seen.ids for _, _, seen in views])
+    numbers = np.repeat(np.array([view[:2] for view in views]).reshape(-1, 2), sizes, axis=0)
+    found = np.concatenate([np.zeros(0, np.int64), *(seen.ids for _, _, seen in views)])
     order = found.argsort(kind="stable")
     rows = order[is_in(found[order], ids)]
     places = (
-        np.concatenate([seen.pixels for _, _, seen in views]),
-        np.concatenate([seen.normalized for _, _, seen in views]),
+        np.concatenate([np.zeros((0, 2)), *(seen.pixels for _, _, seen in views)]),
+        np.concatenate([np.zeros((0, 2)), *(seen.normalized for _, _, seen in views)]),
     )
     feature, (frame, camera) = ids.searchsorted(found[rows]), numbers[rows].T
     every = tuple(range(len(frames)))

@@ -36,7 +36,7 @@ class TailRoot:
     @staticmethod
     def of(gaussian: SquareRootInformation, first: int) -> TailRoot:
         """That of all columns from one on."""
-        return TailRoot(first, gaussian.root_from(first))
+        return TailRoot(first, np.tril(gaussian.root_from(first)))
 
     def from_column(self, first: int) -> FloatArray:
         """The root of the columns from a later one on."""
@@ -58,7 +58,7 @@ class WhitenedUpdate:
         b: (k,) their right-hand side.
 
     Raises:
-        numpy.linalg.LinAlgError: if the rows are not finite.
+        numpy.linalg.LinAlgError: if rows or Gaussian are not finite.
     """
 
     def __init__(
@@ -69,11 +69,11 @@ class WhitenedUpdate:
         S = blas.dsyrk(1.0, Y.T, trans=1, lower=1)
         S[np.diag_indices(len(S))] += 1.0
         self._L, info = lapack.dpotrf(S, lower=1, overwrite_a=1)
-        if info != 0:
-            raise np.linalg.LinAlgError("rows of an update are not finite")
         d = gaussian.d[root.first :]
         z, _ = lapack.dpotrs(self._L, b - Y @ d, lower=1)
         self._x = d + Y.T @ z
+        if info != 0 or not np.isfinite(self._x).all():
+            raise np.linalg.LinAlgError("an update is not finite")
 
     def solution(self) -> FloatArray:
         """The δ (n,) of least cost; zero before the first column of the root."""

@@ -41,8 +41,8 @@ _MAX_EXCHANGES = 300
 """Work limit: after this many conditionals were reordered to recall features, the store closes."""
 
 _MAX_BYTES = 10 * 2**20
-"""Memory of all conditionals. Features that came back were at most 9 MB of them away (stereo tracks
-of openvins_sim)."""
+"""Memory of all conditionals. In one recording whose features come back (stereo tracks of
+openvins_sim) they were at most 9 MB away; with a larger state the same memory holds less time."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -198,7 +198,11 @@ def _exchanged(
     triangle = trapezoidal(rows)
     width = Layout(dims_of(gone)).size
     return (
-        Conditional(Layout(dims_of(gone)), Layout(dims_of([*found, *given])), triangle[:width]),
+        Conditional(
+            Layout(dims_of(gone)),
+            Layout(dims_of([*found, *given])),
+            triangle[:width].copy(),  # a view would keep all rows
+        ),
         Conditional(Layout(dims_of(found)), Layout(dims_of(given)), triangle[width:top, width:]),
     )
 
