@@ -29,7 +29,6 @@ from slam_graph.backend.cost.gating import (
     squared_mahalanobis,
     threshold,
 )
-from slam_graph.backend.cost.measurement_rows import columns_of_state
 from slam_graph.backend.cost.robust_loss import MEDIAN_2D, WIDTH_2D
 from slam_graph.backend.cost.whitened_update import TailRoot, WhitenedUpdate
 from slam_graph.backend.solve.square_root import SquareRootInformation
@@ -107,11 +106,8 @@ class _Columns:
     def of(cost: Cost, linear: Linearization, predicted: SquareRootInformation) -> _Columns:
         """Those of a cost."""
         layout = predicted.layout
-        landmarks, poses = np.zeros((0, 9), np.intp), np.zeros(0, np.intp)
-        if linear.landmarks is not None and cost.landmarks is not None:
-            landmarks = columns_of_state(cost.landmarks, layout, cost.rig.common_keys)
-        if linear.tracks is not None and cost.tracks is not None:
-            poses = layout.indices(cost.rig.keys_of(cost.tracks.obs))
+        obs = None if linear.tracks is None or cost.tracks is None else cost.tracks.obs
+        landmarks, poses = cost.gated_columns(linear, layout, obs)
         first = min(int(part.min(initial=layout.size)) for part in (landmarks, poses))
         return _Columns(landmarks, poses, first)
 

@@ -353,7 +353,7 @@ class Cost:
         obs = None if self.tracks is None or linear.tracks is None else self.tracks.obs
         if obs is not None and tested is not None:  # they are new: few poses have seen them
             obs, tracks = obs.subset(tested).without_idle_frames(), np.zeros(len(tested), np.bool_)
-        columns, of_poses = self._gated_columns(linear, predicted.layout, obs)
+        columns, of_poses = self.gated_columns(linear, predicted.layout, obs)
         first = min(int(part.min(initial=predicted.layout.size)) for part in (columns, of_poses))
         if first == predicted.layout.size:  # no observations
             return Gate(landmarks, tracks, innovations)
@@ -382,7 +382,7 @@ class Cost:
             tracks = is_in(self.tracks.obs.ids, obs.ids[passed])
         return Gate(landmarks, tracks, innovations)
 
-    def _gated_columns(
+    def gated_columns(
         self, linear: Linearization, layout: Layout, obs: Observations | None
     ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
         """Columns of observations of features of the state (N, 9 + C), and of poses of tracks."""
