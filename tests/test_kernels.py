@@ -44,7 +44,12 @@ from slam_graph.kernels.gate import (
     track_distances_numpy,
 )
 from slam_graph.kernels.null_space import triangularize_features, triangularize_features_numpy
-from slam_graph.kernels.patch_search import most_similar, most_similar_numpy
+from slam_graph.kernels.patch_search import (
+    along_rays,
+    along_rays_numpy,
+    most_similar,
+    most_similar_numpy,
+)
 from slam_graph.kernels.pose_steps import pose_steps, pose_steps_numpy
 from slam_graph.kernels.projection import (
     chain_rule,
@@ -401,6 +406,16 @@ def test_most_similar() -> None:
     best = most_similar(one, other, points, candidates, 4, 3, scores[0])
     assert np.array_equal(best, most_similar_numpy(one, other, points, candidates, 4, 3, scores[1]))
     assert same(*scores)
+
+
+def test_along_rays() -> None:
+    rng = np.random.default_rng(7)
+    rays = np.column_stack([rng.uniform(-1.0, 1.0, (30, 2)), rng.uniform(-0.1, 1.0, 30)])
+    shifts = np.outer(np.linspace(0.0, 3.0, 12), [0.11, -0.02, -0.3])
+    found, expected = along_rays(rays, shifts, 1e-3), along_rays_numpy(rays, shifts, 1e-3)
+    assert found.shape == (360, 2)
+    assert np.array_equal(found, expected)
+    assert len(along_rays(rays[:0], shifts, 1e-3)) == 0
 
 
 def test_undistort_radtan() -> None:

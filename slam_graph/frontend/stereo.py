@@ -26,7 +26,7 @@ from slam_graph.frontend.keypoints import Image, Pixels, Tracks
 from slam_graph.frontend.lucas_kanade import LucasKanade
 from slam_graph.frontend.outliers import epipolar_distance, essential_matrix, triangulated_depths
 from slam_graph.kernels.ascending import are_among
-from slam_graph.kernels.patch_search import most_similar
+from slam_graph.kernels.patch_search import along_rays, most_similar
 from slam_graph.sensors import Camera, Rig, RigCamera
 
 _OVERLAP_GRID = 8
@@ -49,6 +49,10 @@ _PATCH_RADIUS = 3
 
 _SEARCH_STEP_PX = 1.0
 """Largest distance, in the reduced image, between neighbouring candidates at the image centre."""
+
+_NEAREST = 1e-3
+"""Candidates that are less far ahead of the other camera, as a share of their depth in the
+reference, count as if they were so far ahead."""
 
 MIN_SCORE = 0.6
 """Smallest normalised cross-correlation of a candidate that Lucas-Kanade starts from."""
@@ -144,15 +148,12 @@ class _EpipolarSearch:
         rays = np.column_stack([normalized, np.ones(len(normalized))])
         if self._camera.model.sees_sideways:
             rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-        # coordinate by coordinate: there are many points, and numbers in a row take half the time
-        moved = np.outer(self._t, inverse_depth_per_m)[:, None]
-        x, y, z = (rays @ self._R.T).T[:, :, None] + moved
-        z = np.maximum(z, 1e-3)
-        m = np.stack([x / z, y / z]).reshape(2, -1).T
+        shifts = np.outer(inverse_depth_per_m, self._t)
+        m = along_rays(rays @ self._R.T, shifts, _NEAREST)
         pixels = self._camera.pixels(m)
         if self._camera.model.sees_sideways:  # beyond its reach a point may come out in the image
             pixels[~self._camera.within_reach(m, MAX_TANGENT)] = _FAR_OFF_PX
-        return np.ascontiguousarray(pixels.reshape(*x.shape, 2))
+        return np.ascontiguousarray(pixels.reshape(len(rays), -1, 2))
 
     def search(
         self, reference: Image, other: Image, pixels: Pixels, normalized: FloatArray

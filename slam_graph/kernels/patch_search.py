@@ -1,6 +1,9 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""The candidate whose patch is most similar to that of a point in another image."""
+"""The candidate whose patch is most similar to that of a point in another image.
+
+Candidates lie along the ray of a point; where the other camera sees them is a kernel, too.
+"""
 
 from __future__ import annotations
 
@@ -12,13 +15,44 @@ from numpy.typing import NDArray
 from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.kernels.compilation import compiled
 
-__all__ = ["most_similar", "most_similar_numpy"]
+__all__ = ["along_rays", "along_rays_numpy", "most_similar", "most_similar_numpy"]
 
 _Image = NDArray[np.uint8]
 _Patch = NDArray[np.int16]
 
 _at = np.uintp
 """An index without a sign. Numba would test others for negative ones, and not use vectors."""
+
+
+@compiled("f8[:, ::1](f8[:, ::1], f8[:, ::1], f8)")
+def along_rays(rays: FloatArray, shifts: FloatArray, nearest: float) -> FloatArray:
+    """Where a camera sees points along the rays of another one, on the plane z = 1.
+
+    There are many points, and NumPy would go through all of them eight times.
+
+    Args:
+        rays: (N, 3) of the other camera, turned into the frame of this one.
+        shifts: (C, 3) the way to the other camera, divided by each distance along the rays.
+        nearest: points nearer than this, in units of that distance, are seen as if so near.
+
+    Returns:
+        (N C, 2) normalised points, those of a ray one behind the other.
+    """
+    count = len(shifts)
+    seen = np.empty((len(rays) * count, 2))
+    for n in range(len(rays)):
+        for c in range(count):
+            depth = max(rays[n, 2] + shifts[c, 2], nearest)
+            seen[n * count + c, 0] = (rays[n, 0] + shifts[c, 0]) / depth
+            seen[n * count + c, 1] = (rays[n, 1] + shifts[c, 1]) / depth
+    return seen
+
+
+def along_rays_numpy(rays: FloatArray, shifts: FloatArray, nearest: float) -> FloatArray:
+    """`along_rays` in NumPy."""
+    points = (rays[:, None] + shifts).reshape(-1, 3)
+    seen: FloatArray = points[:, :2] / np.maximum(points[:, 2:], nearest)
+    return seen
 
 
 @compiled()
