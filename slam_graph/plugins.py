@@ -70,6 +70,7 @@ class Registry(Mapping[str, PartT], Generic[PartT]):
         self._names = names
         self._accepts = accepts
         self._parts: dict[str, PartT] = {}
+        self._complete = home is None
         self._plugins: dict[str, list[EntryPoint]] | None = None
 
     def register(self, name: str) -> Callable[[RegisteredT], RegisteredT]:
@@ -156,6 +157,8 @@ class Registry(Mapping[str, PartT], Generic[PartT]):
 
     def _own(self) -> dict[str, PartT]:
         """What was registered with a decorator, once the package's own parts are there."""
+        if self._complete:  # names are looked up in every frame: no lock then
+            return self._parts
         with _IMPORTING:
             if self._home is not None:
                 home, self._home = self._home, None  # none while it is imported: it registers here
@@ -164,6 +167,7 @@ class Registry(Mapping[str, PartT], Generic[PartT]):
                 except BaseException:
                     self._home = home
                     raise
+                self._complete = True
         return self._parts
 
     def _offered(self) -> dict[str, list[EntryPoint]]:

@@ -16,7 +16,7 @@ from slam_graph.frontend.extraction import FeatureExtractor
 from slam_graph.frontend.frontend_config import FrontendConfig
 from slam_graph.frontend.frontend_protocol import Feedback, FrameStats
 from slam_graph.frontend.image_rotation import ImageRotation
-from slam_graph.frontend.keypoints import Image, Pixels, Tracks
+from slam_graph.frontend.keypoints import Image, Tracks
 from slam_graph.frontend.lost_features import LostFeatures
 from slam_graph.frontend.lucas_kanade import BLUR_PER_PX
 from slam_graph.frontend.moving_tracks import MovingTracks
@@ -95,19 +95,20 @@ class CameraTracker:
             guess = self._predictor.predict(before, stamp_ns, feedback)
             found = self._associator.follow(before, image, guess)
             kept = found.good.nonzero()[0]
-            allowed = self._extractor.allows(found.points.take(kept, axis=0))
-            kept = kept[allowed]
-            self._stats.count(**found.lost, lost_mask=~allowed)
-        with self._stats.timed("ransac_ms"):
             points = found.points.take(kept, axis=0)
+            allowed = self._extractor.allows(points)
+            self._stats.count(**found.lost, lost_mask=~allowed)
+            if np.count_nonzero(allowed) < len(allowed):
+                kept, points = kept[allowed], points.compress(allowed, axis=0)
+        with self._stats.timed("ransac_ms"):
             normalized = self._camera.undistort(points.astype(np.float64))
-            after = Tracks.of(image, stamp_ns, before.ids[kept], points, normalized)
+            after = Tracks.of(image, stamp_ns, before.ids.take(kept), points, normalized)
             self._moving.next_frame()
             moves = self._moving.among(after.ids)
             tested = (~moves).nonzero()[0]
             starts = self._unrolled(before).take(kept[tested], axis=0)
             places = starts, self._unrolled(after).take(tested, axis=0)
-            scale = self._tolerance_scale(before.pixels.take(kept, axis=0), after.pixels)
+            scale = self._tolerance_scale(before, kept, after)
             motions = [tested[rows] for rows in self._rigid_motions(*places, scale)]
             self._motion_ids = [after.ids[rows] for rows in motions]
             inlier = moves.copy()
@@ -116,17 +117,20 @@ class CameraTracker:
                 self._moving.suspect(after.ids[~inlier])
                 self._stats.count(moving=self._moving.among(after.ids))
                 inlier[:] = True
-            in_map = np.ones(len(after), np.bool_)
+            self._stats.count(rejected_ransac=~inlier)
+            self._stats.add("rejected_map", 0)
             if self._config.map_check_px is not None:
-                in_map[inlier] = self._fits_map(after.select(inlier), stamp_ns, feedback)
-            self._stats.count(rejected_ransac=~inlier, rejected_map=inlier & ~in_map)
-            inlier &= in_map
+                rows = inlier.nonzero()[0]
+                wrong = rows[~self._fits_map(after.select(rows), stamp_ns, feedback)]
+                self._stats.add("rejected_map", len(wrong))
+                inlier[wrong] = False
             self.outliers, after = after.select(~inlier), after.select(inlier)
         with self._stats.timed("temporal_ms"):
             after = self._recovered(before, after)
         alone = apart(np.ascontiguousarray(after.pixels), _MERGE_DISTANCE_PX)
-        self._stats.count(lost_merged=~alone)
-        if not alone.all():
+        merged = len(alone) - int(np.count_nonzero(alone))
+        self._stats.add("lost_merged", merged)
+        if merged:
             after = after.select(alone)
         return self._with_residual_flow(before, after)
 
@@ -140,9 +144,9 @@ class CameraTracker:
         """
         here, there = after.common(before)
         moves = self._moving.among(after.ids)
-        self._extractor.count_apart(after.pixels.compress(moves, axis=0))
-        rest = ~moves[here]  # others would spoil the motion of these
-        here, there = here[rest], there[rest]
+        self._extractor.count_apart(after.pixels.take(moves.nonzero()[0], axis=0))
+        rest = (~moves.take(here)).nonzero()[0]  # others would spoil the motion of these
+        here, there = here.take(rest), there.take(rest)
         verify = self._config.verify_new and len(here) >= MIN_POINTS
         with self._stats.timed("detect_ms"):
             candidates = self._associator.propose(before, after, verify)
@@ -150,9 +154,9 @@ class CameraTracker:
             places = [points] if candidates.origins is None else [points, candidates.origins]
             undistorted = self._camera.undistort(np.concatenate(places).astype(np.float64))
             normalized, origins = undistorted[:count], undistorted[count:]
-            good = np.ones(count, np.bool_)
-            flow = np.full((count, 2), np.nan)
-            if candidates.origins is not None:
+            if candidates.origins is None:
+                good, flow = np.ones(count, np.bool_), np.full((count, 2), np.nan)
+            else:
                 starts = self._unrolled(before).take(there, axis=0)
                 followed = self._unrolled(after).take(here, axis=0)
                 motions = self._motions(after.ids[here], starts, followed)
@@ -163,13 +167,15 @@ class CameraTracker:
                 seconds = (after.stamp_ns - before.stamp_ns) * 1e-9
                 flow = self._predictor.residual_flow(origins, ends, seconds)
             self._stats.count(rejected_new=~good, new=good)
-            fits = good.copy()
+            fits = good
             if self._moving.keeps:
-                good[:] = True
-            ids = np.arange(next_id, next_id + np.count_nonzero(good), dtype=np.int64)
-            self._moving.suspect(ids[~fits[good]])
+                good = np.ones(count, np.bool_)
+            rows = good.nonzero()[0]
+            ids = np.arange(next_id, next_id + len(rows), dtype=np.int64)
+            if self._moving.keeps:
+                self._moving.suspect(ids[~fits])
             self._associator.accept(ids, good)
-        chosen = (values.compress(good, axis=0) for values in (points, normalized, flow))
+        chosen = (values.take(rows, axis=0) for values in (points, normalized, flow))
         new = Tracks(after.image, after.stamp_ns, ids, *chosen)
         found = self._with_corners_of_objects(after.joined(new), next_id + len(ids))
         if self._lost is not None:
@@ -210,29 +216,29 @@ class CameraTracker:
         """Normalised coordinates (N, 2) of features as all rows would see them at one time."""
         return self._predictor.unrolled(tracks.pixels, tracks.normalized, tracks.stamp_ns)
 
-    def _tolerance_scale(self, before: Pixels, after: Pixels) -> float:
-        """By how much blur loosens the test of matches (N, 2), in the median; 1 with a gyroscope.
+    def _tolerance_scale(self, before: Tracks, rows: IntArray, after: Tracks) -> float:
+        """By how much blur loosens the test of features (rows (N,) before), in the median.
 
-        With one it is as it is, since other features are replaced at no loss.
+        With a gyroscope by nothing, a factor of 1, since other features are replaced at no loss.
         """
-        if self._lost is None or len(before) == 0:
+        if self._lost is None or len(rows) == 0:
             return 1.0
-        moved_px = float(median(np.linalg.norm(after - before, axis=1)))
+        moved = after.pixels - before.pixels.take(rows, axis=0)
+        moved_px = float(median(np.linalg.norm(moved, axis=1)))
         return 1.0 + BLUR_PER_PX * moved_px / self._config.epipolar_px
 
     def _rigid_motions(self, before: FloatArray, after: FloatArray, scale: float) -> list[IntArray]:
         """The rows of the matches (N, 2) that fit each rigid motion, the largest group first."""
-        everything = np.arange(len(before))
         if self._config.outliers == "none":
-            return [everything]
+            return [np.arange(len(before))]
 
         def inliers(rows: IntArray) -> BoolArray:
             return self._inliers(before.take(rows, axis=0), after.take(rows, axis=0), scale)
 
         largest = self._inliers(before, after, scale)
         return [
-            everything[largest],
-            *coherent_groups(inliers, everything[~largest], len(before)),
+            largest.nonzero()[0],
+            *coherent_groups(inliers, (~largest).nonzero()[0], len(before)),
         ]
 
     def _inliers(self, before: FloatArray, after: FloatArray, scale: float = 1.0) -> BoolArray:
@@ -257,6 +263,8 @@ class CameraTracker:
 
     def _motions(self, ids: IntArray, start: FloatArray, end: FloatArray) -> list[FloatArray]:
         """The fundamental matrix (3, 3) of each rigid motion of features (N,) in both images."""
+        if len(self._motion_ids) < 2:
+            return [fitted_motion(self._camera, start, end)]
         others = [are_among(ids, moved) for moved in self._motion_ids[1:]]
         rest = np.ones(len(ids), np.bool_)
         for other in others:
@@ -302,8 +310,10 @@ class CameraTracker:
         """The same features with their residual flow since the image before."""
         here, there = after.common(before)
         seconds = (after.stamp_ns - before.stamp_ns) * 1e-9
-        start, end = self._unrolled(before), self._unrolled(after)
-        after.residual_flow[here] = self._predictor.residual_flow(
-            start.take(there, axis=0), end.take(here, axis=0), seconds
-        )
+        start, end = self._unrolled(before).take(there, axis=0), self._unrolled(after)
+        if len(here) == len(after):  # unless some were lost in the image before
+            after.residual_flow[:] = self._predictor.residual_flow(start, end, seconds)
+        else:
+            end = end.take(here, axis=0)
+            after.residual_flow[here] = self._predictor.residual_flow(start, end, seconds)
         return after

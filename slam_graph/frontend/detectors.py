@@ -172,9 +172,8 @@ class _ShiTomasiCorners(_GradientCorners):
         half_widths: IntArray,
     ) -> tuple[Pixels, IntArray, IntArray]:
         """The strongest corners of each cell, which are far apart; see `CellDetector`."""
-        size = int(np.prod(cells[:, 2:] - cells[:, :2] + 2 * margin_px, axis=1).max(initial=0))
-        if size > len(self._room):
-            self._room = np.empty(size, np.float32)
+        if image.size > len(self._room):  # enough for any cell; what is not used takes no memory
+            self._room = np.empty(image.size, np.float32)
         points = np.empty((surplus * int(wanted.sum()), 2), np.float32)
         counts, quotas = np.empty(len(cells), np.int64), np.empty(len(cells), np.int64)
         places = contiguous(image), free, np.ascontiguousarray(cells), margin_px

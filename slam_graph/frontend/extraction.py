@@ -125,7 +125,8 @@ class FeatureExtractor:
             for across in pairwise(xs.tolist())
         ]
         self._bounds = np.array([(c.left, c.top, c.right, c.bottom) for c in self._cells], np.int64)
-        self._edges = xs, ys
+        # borders between cells, of the type of pixels: they need not be converted for each search
+        self._edges = xs[1:-1].astype(np.float32), ys[1:-1].astype(np.float32)
         allowed = np.zeros((height, width), np.uint8)
         allowed[BORDER_PX : height - BORDER_PX, BORDER_PX : width - BORDER_PX] = 255
         self._allowed = allowed if mask is None else np.where(mask >= 128, allowed, np.uint8(0))
@@ -263,8 +264,8 @@ class FeatureExtractor:
         """How many points (N, 2) lie in each cell."""
         xs, ys = self._edges
         columns, rows = self._config.grid
-        column = xs[1:-1].searchsorted(points[:, 0], side="right")
-        row = ys[1:-1].searchsorted(points[:, 1], side="right")
+        column = xs.searchsorted(points[:, 0], side="right")
+        row = ys.searchsorted(points[:, 1], side="right")
         return np.bincount(row * columns + column, minlength=columns * rows)
 
     def _free(self, occupied: Pixels) -> Image:

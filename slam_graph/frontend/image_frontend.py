@@ -17,7 +17,7 @@ from slam_graph.frontend.extraction import FeatureExtractor, camera_mask
 from slam_graph.frontend.frontend_config import DESCRIPTORS, FRONTENDS, FrontendConfig
 from slam_graph.frontend.frontend_protocol import STANDARD_GRAVITY, Feedback, FrameStats
 from slam_graph.frontend.image_rotation import ImageRotation
-from slam_graph.frontend.keypoints import Image, Tracks
+from slam_graph.frontend.keypoints import NO_TRACKS, Image, Tracks
 from slam_graph.frontend.lost_features import LostFeatures
 from slam_graph.frontend.lucas_kanade import BLUR_PER_PX, CornerTracking, LucasKanade
 from slam_graph.frontend.matching import DescriptorMatching
@@ -28,6 +28,8 @@ from slam_graph.sensors import CameraFrame, FeatureFrame, FeatureObservations, I
 
 _FEW_FEATURES = 15
 """A warning is given when fewer features than this are left of a frame that had more."""
+
+_GREY = np.dtype(np.uint8)
 
 CLAHE_CLIP_LIMIT, CLAHE_TILES = 3.0, (8, 8)
 """Contrast limit, and columns and rows of tiles, of CLAHE."""
@@ -168,7 +170,7 @@ class ImageFrontend:
             images = [self._equalize(image) for image in self._checked(frame)]
         first_new_id = self._next_id
         for tracker in self._trackers:
-            tracker.outliers = Tracks.empty()
+            tracker.outliers = NO_TRACKS
         for i, image in enumerate(images):
             if image is not None and (
                 self._references[i] == i or images[self._references[i]] is None
@@ -241,7 +243,7 @@ class ImageFrontend:
             )
         for rig_camera, image in zip(cameras, frame.images, strict=True):
             size = (rig_camera.camera.height, rig_camera.camera.width)
-            if image is not None and image.dtype != np.uint8:
+            if image is not None and image.dtype != _GREY:
                 raise DataError(
                     f"frame {frame.stamp_ns}: the image of camera '{rig_camera.name}' has values "
                     f"of type {image.dtype}; convert it to 8 bits (uint8)"
@@ -284,7 +286,8 @@ class ImageFrontend:
                     "few_features", f"{len(after)} of {len(before)} features could be followed"
                 )
             after = tracker.replenish(before, after, self._next_id)
-            self._next_id = max(self._next_id, int(after.ids.max(initial=-1)) + 1)
+            if len(after):  # the last id is the largest
+                self._next_id = max(self._next_id, int(after.ids[-1]) + 1)
         self._alone.add(index)
         self._tracks[index] = after
 

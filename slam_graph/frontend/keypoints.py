@@ -145,7 +145,9 @@ class Tracks:
         normalized: FloatArray,
     ) -> Tracks:
         """Features whose residual flow is not known."""
-        return Tracks(image, stamp_ns, ids, pixels, normalized, np.full((len(ids), 2), np.nan))
+        unknown = np.empty((len(ids), 2))
+        unknown.fill(np.nan)  # a third of the time of `np.full`
+        return Tracks(image, stamp_ns, ids, pixels, normalized, unknown)
 
     @staticmethod
     def empty(image: Image | None = None, stamp_ns: int = 0) -> Tracks:
@@ -173,6 +175,8 @@ class Tracks:
 
     def joined(self, other: Tracks) -> Tracks:
         """These features and others, in the order of their ids."""
+        if len(other) == 0:
+            return self
         ids = np.concatenate([self.ids, other.ids])
         both = Tracks(
             self.image,
@@ -182,6 +186,8 @@ class Tracks:
             np.concatenate([self.normalized, other.normalized]),
             np.concatenate([self.residual_flow, other.residual_flow]),
         )
+        if len(self) == 0 or self.ids[-1] < other.ids[0]:  # as new ones are
+            return both
         return both.select(ids.argsort(kind="stable"))
 
     def common(self, other: Tracks) -> tuple[IntArray, IntArray]:
@@ -197,6 +203,10 @@ class Tracks:
         return FeatureObservations(
             self.ids.copy(), self.pixels.astype(np.float64), self.normalized.copy()
         )
+
+
+NO_TRACKS = Tracks.empty()
+"""No features, of no image."""
 
 
 def spread(pixels: Pixels, count: int, distance_px: float) -> IntArray:

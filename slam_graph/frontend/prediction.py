@@ -149,6 +149,7 @@ class PointPredictor:
         """Take the place and the clock of the camera as they are calibrated now."""
         self._mounted = mounted
         self._body_T_camera = mounted.body_T_camera
+        self._body_R_camera: FloatArray = mounted.body_T_camera.rotation().matrix()
         self._offset_ns = round(mounted.clock_offset_s * 1e9)
         self._turns_rows = mounted.readout_s != 0.0 and mounted.rotation_known
         self._trends.clear()  # they are of the former offset
@@ -160,9 +161,10 @@ class PointPredictor:
             start_R_end = None
         self.rotation_known = start_R_end is not None and self._mode != "flow"
         self._turn_known = False
-        self.camera_R = np.eye(3)
-        if start_R_end is not None:
-            body_R_camera = self._body_T_camera.rotation().matrix()
+        if start_R_end is None:
+            self.camera_R = np.eye(3)
+        else:
+            body_R_camera = self._body_R_camera
             self.camera_R = body_R_camera.T @ start_R_end.matrix().T @ body_R_camera
 
     def turn(self, end_R_start: FloatArray, close: bool) -> None:
@@ -191,10 +193,13 @@ class PointPredictor:
             known, by_map = self._by_map(before.ids, stamp_ns, feedback)
             m[known], trusted[known] = by_map[known], True
         sane = self._camera.within_reach(m, MAX_TANGENT)
-        pixels = self._rolled(np.where(sane[:, None], m, 0.0), stamp_ns).astype(np.float32)
+        m[(~sane).nonzero()[0]] = 0.0
+        pixels = self._rolled(m, stamp_ns).astype(np.float32)
         (u, v), last_u, last_v = pixels.T, self._camera.width - 1, self._camera.height - 1
         sane &= ~((u < 0) | (v < 0) | (u > last_u) | (v > last_v))
-        return Prediction(np.where(sane[:, None], pixels, before.pixels), trusted & sane)
+        stays = (~sane).nonzero()[0]
+        pixels[stays] = before.pixels[stays]
+        return Prediction(pixels, trusted & sane)
 
     def body_pose(self, stamp_ns: int) -> gtsam.Pose3 | None:
         """world_T_body at a time of the camera; None where it is not known."""
@@ -229,7 +234,7 @@ class PointPredictor:
         seconds = self._mounted.row_times_s(rows) - self._mounted.middle_s
         rate, slope = self._trend(stamp_ns)
         turn = rate * seconds[:, None] + 0.5 * slope * seconds[:, None] ** 2
-        in_camera = self._body_T_camera.rotation().matrix().T @ turn.T
+        in_camera = self._body_R_camera.T @ turn.T
         rays = np.column_stack([m, np.ones(len(m))])
         rays = Rotation.from_rotvec(sign * in_camera.T).apply(rays)
         turned: FloatArray = rays[:, :2] / np.maximum(rays[:, 2:], 1e-3)
@@ -261,8 +266,8 @@ class PointPredictor:
         """Normalised points (N, 2) after the rotation of the camera; `flow` leaves it out."""
         if self._mode == "flow":
             return normalized.copy()
-        rays = np.ones((len(normalized), 3))
-        rays[:, :2] = normalized
+        rays = np.empty((len(normalized), 3))
+        rays[:, :2], rays[:, 2] = normalized, 1.0
         rays = rays @ self.camera_R.T
         turned: FloatArray = rays[:, :2] / np.maximum(rays[:, 2:], 1e-3)
         return turned
