@@ -72,11 +72,12 @@ class ReferencePatches:
             good: (N,) which of them were tracked; others stay where they are.
         """
         self._image += 1
-        self._remove(self._last_tracked[self._slots] < self._image - _KEPT_IMAGES)
+        self._remove(self._last_tracked.take(self._slots) < self._image - _KEPT_IMAGES)
         own = self._slots_of(before)
         rows = (good & (own >= 0)).nonzero()[0]
-        slots = own[rows]
-        places, warps = points[rows].astype(np.float64), self._warps[slots]
+        slots = own.take(rows)
+        places = points.take(rows, axis=0).astype(np.float64)
+        warps = self._warps.take(slots, axis=0)
         found, correlations = align_patches(
             contiguous(image),
             *(self._templates, self._systems, self._warps, slots),
@@ -84,16 +85,16 @@ class ReferencePatches:
         )
         found &= correlations > _LEAST_CORRELATION
         lost = (~found).nonzero()[0]
-        self._warps[slots[lost]] = warps[lost]
-        changed = _view_has_changed(self._warps[slots])
+        self._warps[slots.take(lost)] = warps.take(lost, axis=0)
+        changed = _view_has_changed(self._warps.take(slots, axis=0))
         found &= ~changed
         points, placed = points.copy(), found.nonzero()[0]
-        points[rows[placed]] = places[placed]
+        points[rows.take(placed)] = places.take(placed, axis=0)
         self._last_tracked[slots] = self._image
-        refusals = np.where(found, 0, self._refusals[slots] + 1)
+        refusals = (self._refusals.take(slots) + 1) * ~found
         self._refusals[slots] = refusals
         given_up = changed | (refusals >= _MOST_REFUSALS)
-        if given_up.any():  # they get new ones in the next image
+        if np.count_nonzero(given_up):  # they get new ones in the next image
             self._remove(are_among(self._ids, before.ids[rows[given_up]]))
         return points
 
@@ -102,7 +103,7 @@ class ReferencePatches:
         self._remove(are_among(self._ids, np.sort(np.asarray(ids, np.int64))))
 
     def _remove(self, which: BoolArray) -> None:
-        if which.any():
+        if np.count_nonzero(which):
             self._free += self._slots[which].tolist()
             self._ids, self._slots = self._ids[~which], self._slots[~which]
 
@@ -111,8 +112,8 @@ class ReferencePatches:
         assert tracks.image is not None
         if len(self._ids):
             at = self._ids.searchsorted(tracks.ids)
-            same = self._ids.take(at, mode="clip") == tracks.ids
-            slots = np.where(same, self._slots.take(at, mode="clip"), -1)
+            slots = self._slots.take(at, mode="clip")
+            slots[self._ids.take(at, mode="clip") != tracks.ids] = -1
         else:
             slots = np.full(len(tracks), -1)
         new = (slots < 0).nonzero()[0]

@@ -24,8 +24,9 @@ from slam_graph.frontend.extraction import FeatureExtractor
 from slam_graph.frontend.frontend_config import FrontendConfig
 from slam_graph.frontend.keypoints import Image, Pixels, Tracks
 from slam_graph.frontend.lucas_kanade import LucasKanade
-from slam_graph.frontend.outliers import epipolar_distance, essential_matrix, triangulated_depths
+from slam_graph.frontend.outliers import epipolar_distance, essential_matrix
 from slam_graph.kernels.ascending import are_among
+from slam_graph.kernels.epipolar import ray_depths
 from slam_graph.kernels.patch_search import along_rays, most_similar
 from slam_graph.sensors import Camera, Rig, RigCamera
 
@@ -124,13 +125,17 @@ class _EpipolarSearch:
         camera: the one that is searched in.
         other_T_reference: pose of the reference camera in the frame of `camera`.
         min_depth_m: depth of the nearest candidate.
+
+    Attributes:
+        R, t: of `other_T_reference`.
     """
 
     def __init__(self, camera: Camera, other_T_reference: gtsam.Pose3, min_depth_m: float) -> None:
         self._camera = camera
-        self._R = other_T_reference.rotation().matrix()
-        self._t = other_T_reference.translation()
-        disparity_px = camera.fx * float(np.linalg.norm(self._t)) / min_depth_m
+        # arrays as kernels take them: in rows, and not read-only
+        self.R: FloatArray = np.array(other_T_reference.rotation().matrix(), order="C")
+        self.t: FloatArray = np.array(other_T_reference.translation())
+        disparity_px = camera.fx * float(np.linalg.norm(self.t)) / min_depth_m
         count = int(disparity_px / (_SEARCH_STEP_PX * 2**_HALVINGS)) + 2
         self._inverse_depths = np.linspace(0.0, 1.0 / min_depth_m, count)
 
@@ -148,8 +153,8 @@ class _EpipolarSearch:
         rays = np.column_stack([normalized, np.ones(len(normalized))])
         if self._camera.model.sees_sideways:
             rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-        shifts = np.outer(inverse_depth_per_m, self._t)
-        m = along_rays(rays @ self._R.T, shifts, _NEAREST)
+        shifts = np.outer(inverse_depth_per_m, self.t)
+        m = along_rays(rays @ self.R.T, shifts, _NEAREST)
         pixels = self._camera.pixels(m)
         if self._camera.model.sees_sideways:  # beyond its reach a point may come out in the image
             pixels[~self._camera.within_reach(m, MAX_TANGENT)] = _FAR_OFF_PX
@@ -222,7 +227,6 @@ class StereoMatcher:
         self._camera = camera
         self._reference = reference
         self._wide = camera.model.sees_sideways or reference.model.sees_sideways
-        self._other_T_reference = other_T_reference
         self._essential = essential_matrix(other_T_reference)
         self._baseline_m = float(np.linalg.norm(other_T_reference.translation()))
         self._lucas_kanade = lucas_kanade
@@ -249,19 +253,19 @@ class StereoMatcher:
         if reference_image is None or len(reference) == 0:
             return Tracks.empty(image, stamp_ns)
         worthwhile, guess = self._guess(reference, reference_image, image, first_new_id)
-        reference, guess = reference.select(worthwhile), guess.compress(worthwhile, axis=0)
-        flow = self._lucas_kanade.flow(reference_image, image, reference.pixels, guess, LEVELS)
-        keep = flow.found & (flow.error_px < self._config.forward_backward_px)
-        keep[keep] = self._extractor.allows(flow.points.compress(keep, axis=0))
-        reference, pixels = reference.select(keep), flow.points.compress(keep, axis=0)
+        rows = worthwhile.nonzero()[0]  # of `reference`; `take` needs less time than masks
+        starts, guess = reference.pixels.take(rows, axis=0), guess.take(rows, axis=0)
+        flow = self._lucas_kanade.flow(reference_image, image, starts, guess, LEVELS)
+        kept = (flow.found & (flow.error_px < self._config.forward_backward_px)).nonzero()[0]
+        kept = kept[self._extractor.allows(flow.points.take(kept, axis=0))]
+        rows, pixels = rows.take(kept), flow.points.take(kept, axis=0)
         normalized = self._camera.undistort(pixels.astype(np.float64))
-        good = self._inliers(reference.normalized, normalized)
-        matched = int(np.count_nonzero(good))
-        self.counts = _MatchCounts(matched, len(good) - matched)
-        matches = Tracks.of(image, stamp_ns, reference.ids, pixels, normalized).select(good)
-        self._ids = matches.ids
-        self._offsets = matches.pixels - reference.pixels.compress(good, axis=0)
-        return matches
+        good = self._inliers(reference.normalized.take(rows, axis=0), normalized).nonzero()[0]
+        self.counts = _MatchCounts(len(good), len(rows) - len(good))
+        rows, pixels = rows.take(good), pixels.take(good, axis=0)
+        self._ids = reference.ids.take(rows)
+        self._offsets = pixels - reference.pixels.take(rows, axis=0)
+        return Tracks.of(image, stamp_ns, self._ids, pixels, normalized.take(good, axis=0))
 
     def _guess(
         self, reference: Tracks, reference_image: Image, image: Image, first_new_id: int
@@ -269,26 +273,26 @@ class StereoMatcher:
         """Which features (N,) to look for, and where to start (N, 2)."""
         guess = reference.pixels.copy()
         known = are_among(reference.ids, self._ids)
-        at = self._ids.searchsorted(reference.ids[known])
-        guess[known] += self._offsets.take(at, axis=0)
+        rows = known.nonzero()[0]
+        at = self._ids.searchsorted(reference.ids.take(rows))
+        guess[rows] += self._offsets.take(at, axis=0)
         due = (reference.ids + self._frames) % RETRY_FRAMES == 0
-        seek = ~known & (due | (reference.ids >= first_new_id))
-        if seek.any():
+        rows = (~known & (due | (reference.ids >= first_new_id))).nonzero()[0]
+        if len(rows):
             points, score = self._search.search(
                 _reduce(reference_image),
                 _reduce(image),
-                reference.pixels.compress(seek, axis=0),
-                reference.normalized.compress(seek, axis=0),
+                reference.pixels.take(rows, axis=0),
+                reference.normalized.take(rows, axis=0),
             )
-            guess[seek] = points
-            seek[seek] = score > MIN_SCORE
-        return known | seek, guess
+            guess[rows] = points
+            known[rows] = score > MIN_SCORE
+        return known, guess
 
     def _inliers(self, m_reference: FloatArray, m_other: FloatArray) -> BoolArray:
         """Which matches (N, 2) fit the calibration of the rig, (N,)."""
         focal_px = self._camera.fx
-        pose = self._other_T_reference
-        depth_m = triangulated_depths(pose, m_reference, m_other)[:, 0]
+        depth_m = ray_depths(self._search.R, self._search.t, m_reference, m_other)[:, 0]
         if self._wide:
             camera, other = self._reference, self._camera
             distance_px = distances_px(camera, self._essential, m_reference, m_other, other)

@@ -142,7 +142,7 @@ class RadialTangential(_SolvedInTwoSteps):
 
         m = approach_radtan(q, coefficients, _ROUGH_ITERATIONS, _ROUGH_EPSILON)
         left = np.isnan(m[:, 0])
-        if left.any():
+        if np.count_nonzero(left):
             points, eye = q[left][:, None, :], np.eye(3)
             found = cv2.undistortPointsIter(points, eye, coefficients, eye, eye, _CRITERIA)
             m[left] = np.asarray(found, np.float64)[:, 0, :]
