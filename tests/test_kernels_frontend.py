@@ -20,7 +20,12 @@ from slam_graph.kernels.epipolar import (
 from slam_graph.kernels.halvings import halved, halvings_room
 from slam_graph.kernels.image_turn import turn_steps, turn_steps_numpy
 from slam_graph.kernels.near_pairs import near_pairs, near_pairs_numpy, nearest, nearest_numpy
-from slam_graph.kernels.patch_alignment import align_patches, align_patches_numpy
+from slam_graph.kernels.patch_alignment import (
+    align_patches,
+    align_patches_numpy,
+    judge_patches,
+    judge_patches_numpy,
+)
 from slam_graph.kernels.patch_templates import fill_templates, fill_templates_numpy
 from slam_graph.kernels.spacing import (
     apart,
@@ -29,10 +34,18 @@ from slam_graph.kernels.spacing import (
     claim_numpy,
     clear_disks,
     clear_disks_numpy,
+    in_mask,
+    in_mask_numpy,
 )
-from slam_graph.kernels.undistortion import approach_radtan
+from slam_graph.kernels.undistortion import (
+    approach_radtan,
+    invert_radtan,
+    points_radtan,
+    undistort_radtan,
+)
 from slam_graph.kernels.window_tracking import WINDOW_PX, track_windows
 from slam_graph.kernels.window_tracking_numpy import track_windows_numpy
+from slam_graph.sensors.lens_models import RadialTangential
 
 EUROC = (-0.28340811, 0.07395907, 0.00019359, 1.76187114e-05)
 
@@ -100,6 +113,54 @@ def test_approach_is_that_of_opencv(coefficients: tuple[float, ...], reach: floa
     # it gives up only where the polynomial folds back, or nearly
     assert good.all() == (coefficients[0] > -1.0)
     assert good[np.linalg.norm(q, axis=1) < 0.1].all()
+
+
+@pytest.mark.parametrize("coefficients", [EUROC, (-3.0, 0.0, 0.01, -0.02)])
+def test_inversion_in_one_call(coefficients: tuple[float, ...]) -> None:
+    q, own = np.random.default_rng(6).uniform(-0.8, 0.8, (300, 2)), np.array(coefficients)
+    start = approach_radtan(q, own, 20, 1e-9)
+    found, given_up = invert_radtan(q, own, 20, 1e-9, 3, 1e-10)
+    np.testing.assert_array_equal(found, undistort_radtan(q, start, own, 3, 1e-10))
+    assert given_up == np.count_nonzero(np.isnan(start[:, 0]))
+    assert (given_up == 0) == (coefficients == EUROC)
+
+
+def test_points_radtan() -> None:
+    m = np.random.default_rng(7).uniform(-1.0, 1.0, (300, 2))
+    expected = RadialTangential.points_numpy(m, EUROC)
+    np.testing.assert_array_equal(points_radtan(m, np.array(EUROC)), expected)
+    others = [m.T.copy().T, np.repeat(m, 2, axis=0)[::2]]
+    read_only = m.copy()
+    read_only.flags.writeable = False
+    for same in (*others, read_only):
+        np.testing.assert_array_equal(RadialTangential().points(same, EUROC), expected)
+
+
+def test_in_mask() -> None:
+    rng = np.random.default_rng(9)
+    mask = np.where(rng.random((100, 120)) < 0.7, np.uint8(255), np.uint8(0))
+    points = rng.uniform(-10.0, 130.0, (400, 2)).astype(np.float32)
+    points[:2] = [119.5, 50.0], [119.4, 99.5]  # beyond the last column and row, and not quite
+    found = in_mask(mask, points)
+    assert np.array_equal(found, in_mask_numpy(mask, points))
+    assert 0 < np.count_nonzero(found) < 300
+
+
+def test_judge_patches() -> None:
+    rng = np.random.default_rng(10)
+    rows = rng.permutation(90)[:80]
+    former = np.eye(2) + rng.normal(0.0, 0.1, (80, 2, 2))
+    warps = np.eye(2) + rng.normal(0.0, 0.3, (90, 2, 2))
+    found, correlations = rng.random(80) < 0.8, rng.uniform(0.5, 1.0, 80)
+    results = []
+    for judge in (judge_patches, judge_patches_numpy):
+        own, after, refusals = found.copy(), warps.copy(), np.arange(90) % 4
+        limits = 0.7, 0.6, 1.5, 1.6, 3
+        given_up = judge(own, correlations, rows, former, after, refusals, *limits)
+        assert 0 < np.count_nonzero(given_up) < np.count_nonzero(~own) < 80
+        results.append((given_up, own, after, refusals))
+    for one, other in zip(*results, strict=True):
+        np.testing.assert_array_equal(one, other)
 
 
 def disk(radius: int) -> np.ndarray:

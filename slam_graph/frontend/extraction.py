@@ -17,7 +17,7 @@ from slam_graph.frontend.detectors import CellDetector, refine
 from slam_graph.frontend.frontend_config import DETECTORS, FrontendConfig
 from slam_graph.frontend.keypoints import Image, Keypoints, Pixels, spread
 from slam_graph.image_files import ImageFile
-from slam_graph.kernels.spacing import claim, clear_disks
+from slam_graph.kernels.spacing import claim, clear_disks, in_mask
 from slam_graph.sensors import Camera
 
 BORDER_PX = 5
@@ -136,10 +136,8 @@ class FeatureExtractor:
         self._apart: Pixels = np.zeros((0, 2), np.float32)
 
     def allows(self, points: Pixels) -> BoolArray:
-        """Which points (N, 2), all inside the image, the mask allows."""
-        u, v = np.rint(points).astype(int).T
-        result: BoolArray = self._allowed.take(v * self._allowed.shape[1] + u) > 0
-        return result
+        """Which points (N, 2) the mask allows; none outside of the image."""
+        return in_mask(self._allowed, np.ascontiguousarray(points))
 
     def count_apart(self, points: Pixels) -> None:
         """Do not count some of the features (N, 2): they move, and say nothing of the platform.

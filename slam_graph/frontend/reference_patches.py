@@ -22,7 +22,7 @@ from slam_graph.arrays import BoolArray, FloatArray, IntArray
 from slam_graph.frontend.association import inside
 from slam_graph.frontend.keypoints import Image, Pixels, Tracks, contiguous
 from slam_graph.kernels.ascending import are_among
-from slam_graph.kernels.patch_alignment import PATCH_PX, ROW_PX, align_patches
+from slam_graph.kernels.patch_alignment import PATCH_PX, ROW_PX, align_patches, judge_patches
 from slam_graph.kernels.patch_templates import fill_templates
 
 _ITERATIONS, _STEP_PX = 2, 0.05
@@ -83,17 +83,13 @@ class ReferencePatches:
             *(self._templates, self._systems, self._warps, slots),
             *(places, _ITERATIONS, _STEP_PX),
         )
-        found &= correlations > _LEAST_CORRELATION
-        lost = (~found).nonzero()[0]
-        self._warps[slots.take(lost)] = warps.take(lost, axis=0)
-        changed = _view_has_changed(self._warps.take(slots, axis=0))
-        found &= ~changed
+        given_up = judge_patches(
+            *(found, correlations, slots, warps, self._warps, self._refusals),
+            *(_LEAST_CORRELATION, _SMALLEST, _LARGEST, _MOST_STRETCHED, _MOST_REFUSALS),
+        )
         points, placed = points.copy(), found.nonzero()[0]
         points[rows.take(placed)] = places.take(placed, axis=0)
         self._last_tracked[slots] = self._image
-        refusals = (self._refusals.take(slots) + 1) * ~found
-        self._refusals[slots] = refusals
-        given_up = changed | (refusals >= _MOST_REFUSALS)
         if np.count_nonzero(given_up):  # they get new ones in the next image
             self._remove(are_among(self._ids, before.ids[rows[given_up]]))
         return points
@@ -154,15 +150,6 @@ class ReferencePatches:
             self._last_tracked = _longer(self._last_tracked, more)
         taken, self._free = self._free[:count], self._free[count:]
         return np.array(taken, np.int64)
-
-
-def _view_has_changed(warps: FloatArray) -> BoolArray:
-    """Whether warps (N, 2, 2) change the area or the shape of a patch too much."""
-    (a, b), (c, d) = warps.transpose(1, 2, 0)
-    areas = a * d - b * c  # the product of the singular values, of whose squares this is the sum:
-    squares = a * a + b * b + c * c + d * d
-    stretched = squares > (_MOST_STRETCHED + 1.0 / _MOST_STRETCHED) * areas
-    return np.asarray((areas < _SMALLEST) | (areas > _LARGEST) | stretched)
 
 
 def _longer(rows: NDArray[Any], count: int) -> NDArray[Any]:

@@ -18,7 +18,14 @@ from numpy.typing import NDArray
 from slam_graph.arrays import BoolArray, FloatArray, IntArray
 from slam_graph.kernels.compilation import compiled
 
-__all__ = ["PATCH_PX", "ROW_PX", "align_patches", "align_patches_numpy"]
+__all__ = [
+    "PATCH_PX",
+    "ROW_PX",
+    "align_patches",
+    "align_patches_numpy",
+    "judge_patches",
+    "judge_patches_numpy",
+]
 
 PATCH_PX, ROW_PX = 15, 16
 """Side of a patch, and the length of its rows in memory: with one zero at the end it is a multiple
@@ -289,3 +296,79 @@ def align_patches_numpy(
                 points[i], warps[n] = place, warp
                 break
     return found, correlations
+
+
+@compiled(
+    "b1[::1](b1[::1], f8[::1], i8[::1], f8[:, :, ::1], f8[:, :, ::1], i8[::1], f8, f8, f8, f8, i8)"
+)
+def judge_patches(
+    found: BoolArray,
+    correlations: FloatArray,
+    rows: IntArray,
+    former: FloatArray,
+    warps: FloatArray,
+    refusals: IntArray,
+    least_correlation: float,
+    smallest: float,
+    largest: float,
+    most_stretched: float,
+    most_refusals: int,
+) -> BoolArray:
+    """Which templates to give up, after they were looked for by `align_patches`.
+
+    Args:
+        found: (N,) from there; made false where the two are not alike, or the view has changed.
+        correlations: (N,) from there.
+        rows: (N,) which of the templates these are.
+        former: (N, 2, 2) their warps before.
+        warps: (T, 2, 2) the warps now; where the two are not alike that is undone.
+        refusals: (T,) how many times in a row each was not found; counted on, or set to 0.
+        least_correlation: what is less alike is not taken for the same patch.
+        smallest: change of the area below which the view has changed too much.
+        largest: the same above which it has.
+        most_stretched: and the ratio of the singular values of the warp above which it has.
+        most_refusals: a template that was not found so often is given up.
+
+    Returns:
+        (N,) whether the view has changed too much, or a template was not found too often.
+    """
+    given_up = np.empty(len(rows), np.bool_)
+    for i in range(len(rows)):
+        n = rows[i]
+        found[i] &= correlations[i] > least_correlation
+        if not found[i]:
+            warps[n] = former[i]
+        a, b, c, d = warps[n, 0, 0], warps[n, 0, 1], warps[n, 1, 0], warps[n, 1, 1]
+        area = a * d - b * c  # the product of the singular values, of whose squares this is the sum
+        squares = a * a + b * b + c * c + d * d
+        changed = area < smallest or area > largest
+        changed = changed or squares > (most_stretched + 1.0 / most_stretched) * area
+        found[i] &= not changed
+        refusals[n] = 0 if found[i] else refusals[n] + 1
+        given_up[i] = changed or refusals[n] >= most_refusals
+    return given_up
+
+
+def judge_patches_numpy(
+    found: BoolArray,
+    correlations: FloatArray,
+    rows: IntArray,
+    former: FloatArray,
+    warps: FloatArray,
+    refusals: IntArray,
+    least_correlation: float,
+    smallest: float,
+    largest: float,
+    most_stretched: float,
+    most_refusals: int,
+) -> BoolArray:
+    """`judge_patches` in NumPy."""
+    found &= correlations > least_correlation
+    warps[rows[~found]] = former[~found]
+    areas = np.linalg.det(warps[rows])
+    stretches = np.linalg.svd(warps[rows], compute_uv=False)
+    changed = (areas < smallest) | (areas > largest)
+    changed |= stretches[:, 0] > most_stretched * stretches[:, 1]
+    found &= ~changed
+    refusals[rows] = np.where(found, 0, refusals[rows] + 1)
+    return np.asarray(changed | (refusals[rows] >= most_refusals))

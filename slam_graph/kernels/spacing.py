@@ -10,7 +10,16 @@ from numpy.typing import NDArray
 from slam_graph.arrays import BoolArray, IntArray
 from slam_graph.kernels.compilation import compiled
 
-__all__ = ["apart", "apart_numpy", "claim", "claim_numpy", "clear_disks", "clear_disks_numpy"]
+__all__ = [
+    "apart",
+    "apart_numpy",
+    "claim",
+    "claim_numpy",
+    "clear_disks",
+    "clear_disks_numpy",
+    "in_mask",
+    "in_mask_numpy",
+]
 
 _Mask = NDArray[np.uint8]
 _Pixels = NDArray[np.float32]
@@ -41,6 +50,26 @@ def clear_disks_numpy(mask: _Mask, points: _Pixels, half_widths: IntArray) -> No
         for row, half in enumerate(half_widths.tolist(), v - radius):
             if 0 <= row < len(mask):
                 mask[row, max(0, u - half) : max(0, u + half + 1)] = 0
+
+
+@compiled("b1[::1](u1[:, ::1], f4[:, ::1])")
+def in_mask(mask: _Mask, points: _Pixels) -> BoolArray:
+    """Which points (N, 2) lie where a mask is not zero; none outside of it."""
+    height, width = mask.shape
+    inside = np.empty(len(points), np.bool_)
+    for n in range(len(points)):
+        u, v = int(np.rint(points[n, 0])), int(np.rint(points[n, 1]))
+        inside[n] = 0 <= u < width and 0 <= v < height and mask[v, u] != 0
+    return inside
+
+
+def in_mask_numpy(mask: _Mask, points: _Pixels) -> BoolArray:
+    """`in_mask` in NumPy."""
+    u, v = np.rint(points).astype(int).T
+    height, width = mask.shape
+    inside = (u >= 0) & (v >= 0) & (u < width) & (v < height)
+    inside[inside] = mask[v[inside], u[inside]] != 0
+    return np.asarray(inside)
 
 
 @compiled("i8[::1](u1[:, ::1], f4[:, ::1], i8, f8, i8[::1])")

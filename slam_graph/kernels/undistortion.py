@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""The inverse of the radial-tangential model, for each point by itself."""
+"""The radial-tangential model and its inverse, for each point by itself."""
 
 from __future__ import annotations
 
@@ -11,7 +11,34 @@ import numpy as np
 from slam_graph.arrays import FloatArray
 from slam_graph.kernels.compilation import compiled
 
-__all__ = ["approach_radtan", "undistort_radtan"]
+__all__ = [
+    "approach_radtan",
+    "invert_radtan",
+    "points_radtan",
+    "undistort_radtan",
+]
+
+
+@compiled("f8[:, ::1](f8[:, ::1], f8[::1])")
+def points_radtan(m: FloatArray, coefficients: FloatArray) -> FloatArray:
+    """Points of the image plane (N, 2) where normalised points are seen.
+
+    The NumPy form, which gives the same bits, is `RadialTangential.points_numpy`.
+
+    Args:
+        m: (N, 2) normalised points.
+        coefficients: (4,) k1, k2, p1, p2.
+    """
+    k1, k2, p1, p2 = coefficients
+    q = np.empty_like(m)
+    for n in range(len(m)):
+        x, y = m[n, 0], m[n, 1]
+        xx, yy, xy = x * x, y * y, x * y
+        r2 = xx + yy
+        radial = 1.0 + r2 * (k1 + k2 * r2)
+        q[n, 0] = x * radial + 2.0 * p1 * xy + p2 * (r2 + 2.0 * xx)
+        q[n, 1] = y * radial + p1 * (r2 + 2.0 * yy) + 2.0 * p2 * xy
+    return q
 
 
 @compiled("f8[:, ::1](f8[:, ::1], f8[::1], i8, f8)")
@@ -98,3 +125,24 @@ def undistort_radtan(
                 break
         m[n, 0], m[n, 1] = x, y
     return m
+
+
+@compiled("Tuple((f8[:, ::1], i8))(f8[:, ::1], f8[::1], i8, f8, i8, f8)")
+def invert_radtan(
+    q: FloatArray,
+    coefficients: FloatArray,
+    rough_steps: int,
+    rough_tolerance: float,
+    steps: int,
+    tolerance: float,
+) -> tuple[FloatArray, int]:
+    """`approach_radtan`, then `undistort_radtan` from there, in one call.
+
+    Returns:
+        (N, 2) normalised points; and how many of them are NaN because the first one gave up.
+    """
+    start = approach_radtan(q, coefficients, rough_steps, rough_tolerance)
+    given_up = 0
+    for n in range(len(start)):
+        given_up += int(np.isnan(start[n, 0]))
+    return undistort_radtan(q, start, coefficients, steps, tolerance), given_up

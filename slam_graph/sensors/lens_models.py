@@ -9,7 +9,9 @@ image plane, the inverse is NaN.
 
 from __future__ import annotations
 
+import sys
 from abc import abstractmethod
+from functools import lru_cache
 from typing import Any, ClassVar
 
 import cv2
@@ -83,6 +85,12 @@ _CRITERIA = (
 )
 
 
+@lru_cache
+def _row(coefficients: Coefficients) -> FloatArray:
+    """Coefficients as kernels take them; an array made anew in each call is most of its time."""
+    return np.array(coefficients, np.float64)
+
+
 @register_camera_model
 class RadialTangential(_SolvedInTwoSteps):
     """Brown's model, as OpenCV has it with four coefficients.
@@ -113,6 +121,17 @@ class RadialTangential(_SolvedInTwoSteps):
 
     def points(self, m: FloatArray, coefficients: Coefficients) -> FloatArray:
         """Points q (N, 2) of normalised points m (N, 2)."""
+        # by a kernel, with the same bits, if kernels are there: to make them may take a minute
+        kernels: Any = sys.modules.get("slam_graph.kernels.undistortion")
+        if not hasattr(kernels, "points_radtan"):
+            return self.points_numpy(m, coefficients)
+        own = np.array(m, np.float64, order="C")  # which a kernel takes, whatever was given
+        points: FloatArray = kernels.points_radtan(own, _row(coefficients))
+        return points
+
+    @staticmethod
+    def points_numpy(m: FloatArray, coefficients: Coefficients) -> FloatArray:
+        """`points` without a kernel."""
         k1, k2, p1, p2 = coefficients
         x, y = m[:, 0], m[:, 1]
         xx, yy, xy = x * x, y * y, x * y
@@ -136,13 +155,26 @@ class RadialTangential(_SolvedInTwoSteps):
         fx, fy, cx, cy = intrinsics
         return gtsam.Cal3DS2(fx, fy, 0.0, cx, cy, *coefficients)
 
+    def undistort(
+        self, q: FloatArray, coefficients: Coefficients, near: FloatArray | None = None
+    ) -> FloatArray:
+        """Both steps in one kernel, unless there is a guess, or the kernel gives up on a point."""
+        if near is not None:
+            return super().undistort(q, coefficients, near)
+        from slam_graph.kernels.undistortion import invert_radtan  # which loads kernels
+
+        rough, fine = (_ROUGH_ITERATIONS, _ROUGH_EPSILON), (self._steps, NEWTON_TOLERANCE)
+        places = np.ascontiguousarray(q, np.float64)
+        m, given_up = invert_radtan(places, _row(coefficients), *rough, *fine)
+        return super().undistort(q, coefficients) if given_up else m
+
     def _approached(self, q: FloatArray, coefficients: FloatArray) -> FloatArray:
         """What `cv2.undistortPointsIter` finds; it is asked for where a kernel gives up."""
         from slam_graph.kernels.undistortion import approach_radtan  # which loads kernels
 
         m = approach_radtan(q, coefficients, _ROUGH_ITERATIONS, _ROUGH_EPSILON)
         left = np.isnan(m[:, 0])
-        if np.count_nonzero(left):
+        if left.any():
             points, eye = q[left][:, None, :], np.eye(3)
             found = cv2.undistortPointsIter(points, eye, coefficients, eye, eye, _CRITERIA)
             m[left] = np.asarray(found, np.float64)[:, 0, :]
