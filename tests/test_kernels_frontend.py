@@ -17,9 +17,23 @@ from slam_graph.kernels.epipolar import (
     ray_depths,
     ray_depths_numpy,
 )
-from slam_graph.kernels.halvings import halved, halvings_room
+from slam_graph.kernels.halvings import (
+    halve,
+    halve_numpy,
+    halved,
+    halvings_room,
+    quarter,
+    quarter_numpy,
+)
 from slam_graph.kernels.image_turn import turn_steps, turn_steps_numpy
-from slam_graph.kernels.near_pairs import near_pairs, near_pairs_numpy, nearest, nearest_numpy
+from slam_graph.kernels.near_pairs import (
+    median_motions,
+    median_motions_numpy,
+    near_pairs,
+    near_pairs_numpy,
+    nearest,
+    nearest_numpy,
+)
 from slam_graph.kernels.patch_alignment import (
     align_patches,
     align_patches_numpy,
@@ -96,6 +110,40 @@ def test_nearest(points: int, count: int) -> None:
         nearest(there, places, count), nearest_numpy(there, places, count)
     )
     assert nearest(there, places[:0], count).shape == (0, count)
+    moved = there + rng.normal(0.0, 3.0, there.shape).astype(np.float32)
+    np.testing.assert_array_equal(
+        median_motions(there, moved, places, count),
+        median_motions_numpy(there, moved, places, count),
+    )
+
+
+@pytest.mark.parametrize(
+    "shape", [(480, 752), (33, 48), (5, 64), (34, 6), (3, 4), (2, 2), (1, 2), (19, 130)]
+)
+def test_halvings_are_those_of_opencv(shape: tuple[int, int]) -> None:
+    rng = np.random.default_rng(11)
+    image = rng.integers(0, 256, shape, dtype=np.uint8)
+    for pixels in (image, np.where(image > 99, np.uint8(255), np.uint8(0))):
+        found, expected = np.zeros((2, (shape[0] + 1) // 2, shape[1] // 2), np.uint8)
+        halve(pixels, found)
+        halve_numpy(pixels, expected)
+        np.testing.assert_array_equal(found, expected)
+        np.testing.assert_array_equal(found, cv2.pyrDown(pixels).reshape(found.shape))
+
+
+@pytest.mark.parametrize("shape", [(480, 752), (4, 4), (8, 132), (120, 36)])
+def test_quarters_are_those_of_opencv(shape: tuple[int, int]) -> None:
+    image = np.random.default_rng(12).integers(0, 256, shape, dtype=np.uint8)
+    found, expected = np.zeros((2, shape[0] // 4, shape[1] // 4), np.uint8)
+    quarter(image, found)
+    quarter_numpy(image, expected)
+    np.testing.assert_array_equal(found, expected)
+    for _ in range(2):
+        size = image.shape[1] // 2, image.shape[0] // 2
+        image = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA)).reshape(
+            size[::-1]
+        )
+    np.testing.assert_array_equal(found, image)
 
 
 @pytest.mark.parametrize(

@@ -15,7 +15,7 @@ from slam_graph.frontend.frontend_config import FrontendConfig
 from slam_graph.frontend.frontend_protocol import Feedback
 from slam_graph.frontend.keypoints import Pixels, Tracks
 from slam_graph.geometry import NavState
-from slam_graph.kernels.near_pairs import nearest
+from slam_graph.kernels.near_pairs import median_motions
 from slam_graph.sensors import ImuBuffer, ImuData, ImuNoise, RigCamera
 
 _HISTORY_NS = 2_000_000_000
@@ -299,6 +299,5 @@ def neighbour_flow(start: Pixels, end: Pixels, at: Pixels) -> Pixels:
     """
     if len(start) < _NEIGHBOURS:
         return np.zeros_like(at)
-    neighbours = nearest(np.ascontiguousarray(start), np.ascontiguousarray(at), _NEIGHBOURS)
-    ascending = np.sort((end - start).take(neighbours, axis=0), axis=1)
-    return np.asarray(ascending[:, _NEIGHBOURS // 2], np.float32)
+    places = np.ascontiguousarray(start), np.ascontiguousarray(end), np.ascontiguousarray(at)
+    return median_motions(*places, _NEIGHBOURS)

@@ -11,7 +11,14 @@ from scipy.spatial import cKDTree
 from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.kernels.compilation import compiled
 
-__all__ = ["near_pairs", "near_pairs_numpy", "nearest", "nearest_numpy"]
+__all__ = [
+    "median_motions",
+    "median_motions_numpy",
+    "near_pairs",
+    "near_pairs_numpy",
+    "nearest",
+    "nearest_numpy",
+]
 
 _Pixels = NDArray[np.float32]
 
@@ -80,3 +87,37 @@ def nearest_numpy(points: _Pixels, places: _Pixels, count: int) -> IntArray:
     """`nearest` in SciPy."""
     rows: IntArray = cKDTree(points).query(places, k=count)[1]
     return rows.reshape(len(places), count)
+
+
+@compiled("f4[:, ::1](f4[:, ::1], f4[:, ::1], f4[:, ::1], i8)")
+def median_motions(start: _Pixels, end: _Pixels, places: _Pixels, count: int) -> _Pixels:
+    """The median motion of the points that are nearest to each place, of each coordinate by itself.
+
+    Args:
+        start: (N, 2) where points were, at least `count`.
+        end: (N, 2) where they are.
+        places: (M, 2) near which points were.
+        count: how many of them count for each place, an odd number.
+
+    Returns:
+        (M, 2).
+    """
+    chosen, motions = nearest(start, places, count), np.empty((len(places), 2), np.float32)
+    ascending = np.empty(count, np.float32)
+    for m in range(len(places)):
+        for axis in range(2):
+            for k in range(count):
+                n, place = chosen[m, k], k
+                motion = end[n, axis] - start[n, axis]
+                while place > 0 and ascending[place - 1] > motion:
+                    ascending[place] = ascending[place - 1]
+                    place -= 1
+                ascending[place] = motion
+            motions[m, axis] = ascending[count // 2]
+    return motions
+
+
+def median_motions_numpy(start: _Pixels, end: _Pixels, places: _Pixels, count: int) -> _Pixels:
+    """`median_motions` in NumPy."""
+    motions = (end - start)[nearest_numpy(start, places, count)]
+    return np.asarray(np.median(motions, axis=1), np.float32)
