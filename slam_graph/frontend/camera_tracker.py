@@ -175,8 +175,8 @@ class CameraTracker:
             if self._moving.keeps:
                 self._moving.suspect(ids[~fits])
             self._associator.accept(ids, good)
-        chosen = (values.take(rows, axis=0) for values in (points, normalized, flow))
-        new = Tracks(after.image, after.stamp_ns, ids, *chosen)
+        points, normalized = points.take(rows, axis=0), normalized.take(rows, axis=0)
+        new = Tracks(after.image, after.stamp_ns, ids, points, normalized, flow.take(rows, axis=0))
         found = self._with_corners_of_objects(after.joined(new), next_id + len(ids))
         if self._lost is not None:
             self._lost.remember(found)

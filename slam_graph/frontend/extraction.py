@@ -241,18 +241,19 @@ class FeatureExtractor:
         missing = self._missing(occupied)
         if missing <= 0:
             return np.zeros(0, np.int64), np.zeros(0, np.int64)
-        counts, of_the_world = self._count(occupied), np.ones(len(self._cells), np.bool_)
+        # No cell rests while many features are missing, e.g. after the lens was covered
+        wanting = (self._rest == 0) | (2 * missing > self._config.max_features)
+        counts, sharing = self._count(occupied), len(self._cells)
         if len(self._apart):
             apart = self._count(self._apart)
             counts -= apart
             of_the_world = apart <= counts
-        share = -(-self._config.max_features // max(int(np.count_nonzero(of_the_world)), 1))
-        # No cell rests while many features are missing, e.g. after the lens was covered
-        awake = (self._rest == 0) | (2 * missing > self._config.max_features)
-        wanting = (counts < share) & awake & of_the_world
-        cells = wanting.nonzero()[0]
-        emptiest_first = cells[counts[cells].argsort(kind="stable")]
-        return emptiest_first, share - counts[emptiest_first]
+            sharing = max(int(np.count_nonzero(of_the_world)), 1)
+            wanting &= of_the_world
+        share = -(-self._config.max_features // sharing)
+        cells = (wanting & (counts < share)).nonzero()[0]
+        emptiest_first = cells.take(counts.take(cells).argsort(kind="stable"))
+        return emptiest_first, share - counts.take(emptiest_first)
 
     def _missing(self, occupied: Pixels) -> int:
         """How many features are wanted beside those that are there (N, 2)."""

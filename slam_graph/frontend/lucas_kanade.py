@@ -222,11 +222,15 @@ class CornerTracking:
             rows = (~good if tried is None else tried).nonzero()[0]
             if len(rows) == 0:
                 continue
-            start = before.pixels.take(rows, axis=0)
-            near = guess.points.take(rows, axis=0)
+            start, near, everything = before.pixels, guess.points, len(rows) == n
+            if not everything:
+                start, near = start.take(rows, axis=0), near.take(rows, axis=0)
             flow = self._lucas_kanade.flow(before.image, image, start, near, levels)
-            points[rows], found[rows] = flow.points, flow.found
-            good[rows] = flow.found & (flow.error_px < self._tolerance_px(start, flow.points))
+            close = flow.found & (flow.error_px < self._tolerance_px(start, flow.points))
+            if everything:
+                points, found, good = flow.points, flow.found, close
+            else:
+                points[rows], found[rows], good[rows] = flow.points, flow.found, close
         if self._patches is not None and n > 0:
             points = self._patches.placed(before, image, points, good)
         return Association(points, good, {"lost_klt": ~found, "lost_fb": found & ~good})

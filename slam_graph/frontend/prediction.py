@@ -186,9 +186,11 @@ class PointPredictor:
         if self._mode == "none" or len(before) == 0:
             return Prediction(before.pixels, np.zeros(len(before), np.bool_))
         flow, seconds = before.residual_flow, (stamp_ns - before.stamp_ns) * 1e-9
-        trusted: BoolArray = np.isfinite(flow[:, 0]) & (self.rotation_known | self._turn_known)
-        start = self.unrolled(before.pixels, before.normalized, before.stamp_ns)
-        m = self._rotated(start) + np.where(np.isnan(flow), 0.0, flow) * seconds
+        known_flow = np.isfinite(flow[:, 0])
+        trusted: BoolArray = known_flow & (self.rotation_known | self._turn_known)
+        moved = flow * seconds
+        moved[(~known_flow).nonzero()[0]] = 0.0
+        m = self._rotated(self.unrolled(before.pixels, before.normalized, before.stamp_ns)) + moved
         if self._mode == "state":
             known, by_map = self._by_map(before.ids, stamp_ns, feedback)
             m[known], trusted[known] = by_map[known], True

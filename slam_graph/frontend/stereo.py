@@ -151,7 +151,8 @@ class _EpipolarSearch:
         Returns:
             (N, C, 2); far off the image for points that are not in front of the other camera.
         """
-        rays = np.column_stack([normalized, np.ones(len(normalized))])
+        rays = np.empty((len(normalized), 3))
+        rays[:, :2], rays[:, 2] = normalized, 1.0
         if self._camera.model.sees_sideways:
             rays /= np.linalg.norm(rays, axis=1, keepdims=True)
         shifts = np.outer(inverse_depth_per_m, self.t)

@@ -111,8 +111,9 @@ class Camera:
 
     def pixels(self, normalized: FloatArray) -> FloatArray:
         """Pixels (N, 2) of normalised points (N, 2), in less time than with the derivative."""
-        q = self.model.points(normalized, self.coefficients)
-        return np.asarray(q * self._focal + self._center)
+        pixels = self.model.points(normalized, self.coefficients) * self._focal
+        pixels += self._center
+        return pixels
 
     def project(self, points: FloatArray) -> FloatArray:
         """Pixels (N, 2) of points (N, 3) in the camera frame; the points must have z > 0."""
@@ -142,7 +143,8 @@ class Camera:
         """
         if len(pixels) == 0:
             return np.zeros((0, 2))
-        q = (pixels - self._center) / self._focal
+        q = pixels - self._center
+        q /= self._focal
         return self.model.undistort(q, self.coefficients, near)
 
     def within_reach(self, normalized: FloatArray, max_coordinate: float) -> BoolArray:

@@ -71,9 +71,9 @@ class ImuData:
         Args:
             gyro_bias: (3,) rad/s.
         """
-        durations_s, gyro, _ = self.steps()
+        gyro = 0.5 * (self.gyro[1:] + self.gyro[:-1])
         start_R_end = gtsam.Rot3()
-        for turn in (gyro - gyro_bias) * durations_s[:, None]:
+        for turn in (gyro - gyro_bias) * self._durations_s()[:, None]:
             start_R_end = start_R_end * gtsam.Rot3.Expmap(turn)
         return start_R_end
 
@@ -116,10 +116,11 @@ class ImuData:
         """Durations (N - 1,) in s between samples, mean rates and specific forces (N - 1, 3)."""
         gyro = 0.5 * (self.gyro[1:] + self.gyro[:-1])
         accel = 0.5 * (self.accel[1:] + self.accel[:-1])
-        durations_s = np.asarray(
-            (self.stamps_ns[1:] - self.stamps_ns[:-1]) * 1e-9, dtype=np.float64
-        )
-        return durations_s, gyro, accel
+        return self._durations_s(), gyro, accel
+
+    def _durations_s(self) -> FloatArray:
+        """Durations (N - 1,) in s between samples."""
+        return np.asarray((self.stamps_ns[1:] - self.stamps_ns[:-1]) * 1e-9, dtype=np.float64)
 
 
 def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
