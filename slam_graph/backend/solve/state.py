@@ -235,12 +235,17 @@ class State:
 
     def insert_imu_state(self, frame: int, state: NavState) -> None:
         """Add the pose, velocity and bias of a new frame."""
+        tables = self._poses, self._first_poses
         bias = gtsam.imuBias.ConstantBias(state.accel_bias, state.gyro_bias)
         new = gtsam.Values()  # without their names, types are tried in turn: 28 µs for a bias
         new.insert(X(frame), pose3=state.world_T_body)
         new.insert(V(frame), np.asarray(state.velocity, dtype=np.float64))
         new.insert(B(frame), constant_bias=bias)
         self._insert(new, imu_state_keys(frame))
+        self._poses, self._first_poses = (
+            None if table is None else table.with_pose(frame, state.world_T_body)
+            for table in tables
+        )
 
     def insert_calibration(self, values: gtsam.Values) -> None:
         """Add parameters of the rig or of the position fixes."""
@@ -265,7 +270,11 @@ class State:
         """Forget variables."""
         others, features = told_apart(keys)
         self.points = self.points.without(features)
-        self._poses = self._first_poses = None
+        gone = {key & INDEX_MASK for key in others if key >> LETTER_SHIFT == _POSE_CODE}
+        self._poses, self._first_poses = (
+            None if table is None else table.without(gone)
+            for table in (self._poses, self._first_poses)
+        )
         for key in others:
             self.frames.erase(key)
             self.first_frames.erase(key)
