@@ -13,21 +13,18 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from itertools import accumulate, chain
-from operator import add
+from itertools import accumulate, islice
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import blas, lapack
 
 from slam_graph.arrays import BoolArray, FloatArray
+from slam_graph.backend.solve.triangles import solved, transposed_inverse
 from slam_graph.kernels.elimination import eliminate_columns, zeros_to_the_left
 
 _BLOCK_SIZE = 16
 """Width of the blocks of LAPACK's triangular-pentagonal QR."""
-
-_SMALL_TRIANGLE = 64
-"""Triangles up to this size are inverted at once."""
 
 
 class Layout:
@@ -36,17 +33,24 @@ class Layout:
     Attributes:
         dims: dimension of each key, in the order of the columns.
         size: length of the stacked vector.
+        begin: the layout that this one begins with, if it was made of it.
     """
 
-    def __init__(self, dims: Mapping[int, int]) -> None:
+    def __init__(self, dims: Mapping[int, int], begin: Layout | None = None) -> None:
         self.dims = dict(dims)
         self.size = sum(self.dims.values())
+        self.begin = begin
         self._indices: dict[tuple[int, ...], NDArray[np.intp]] = {}
 
     @cached_property
     def starts(self) -> dict[int, int]:
         """The first column of each key."""
-        return dict(zip(self.dims, accumulate(self.dims.values(), initial=0), strict=False))
+        begin = self.begin
+        known, size = ({}, 0) if begin is None else (begin.starts, begin.size)
+        keys, dims = (
+            islice(of_all, len(known), None) for of_all in (self.dims, self.dims.values())
+        )
+        return known | dict(zip(keys, accumulate(dims, initial=size), strict=False))
 
     @cached_property
     def columns(self) -> dict[int, slice]:
@@ -58,7 +62,11 @@ class Layout:
 
     def extended(self, dims: Mapping[int, int]) -> Layout:
         """The layout with further keys appended."""
-        return Layout({**self.dims, **dims})
+        return Layout({**self.dims, **dims}, self.begin or self)
+
+    def begins_with(self, other: Layout) -> bool:
+        """Whether the first variables are those of another layout, in the same order."""
+        return list(islice(self.dims, len(other.dims))) == list(other.dims)
 
     def indices(self, keys: Iterable[int]) -> NDArray[np.intp]:
         """Column numbers of the keys, in the order given; not to be changed."""
@@ -74,8 +82,10 @@ class Layout:
         if sizes and sizes.count(sizes[0]) == len(sizes):  # of poses, mostly
             columns = np.array(starts, np.intp)[:, None] + np.arange(sizes[0])
             return np.asarray(columns.ravel(), np.intp)
-        ranges = map(range, starts, map(add, starts, sizes))
-        return np.fromiter(chain.from_iterable(ranges), np.intp, sum(sizes))
+        widths = np.array(sizes, np.intp)
+        ends = widths.cumsum()
+        shifts = np.array(starts, np.intp) - (ends - widths)
+        return np.arange(sum(sizes), dtype=np.intp) + shifts.repeat(widths)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -114,7 +124,7 @@ class Conditional:
             numpy.linalg.LinAlgError: if some direction is not determined.
         """
         w = self.gone.size
-        return _solved(self.rows[:, :w], self.rows[:, -1] - self.rows[:, w:-1] @ given)
+        return solved(self.rows[:, :w], self.rows[:, -1] - self.rows[:, w:-1] @ given)
 
     def shifted(self, delta: FloatArray) -> Conditional:
         """The same as a function of δ - delta, delta (w + n,) over `gone` and `given`."""
@@ -158,9 +168,18 @@ class SquareRootInformation:
 
     def extended(self, dims: Mapping[int, int]) -> SquareRootInformation:
         """The same Gaussian with further variables of which nothing is known."""
-        if not dims:
+        return self.over(self.layout.extended(dims)) if dims else self
+
+    def over(self, layout: Layout) -> SquareRootInformation:
+        """The same Gaussian over a layout that begins with its own: of the rest nothing is known.
+
+        Raises:
+            ValueError: if it does not.
+        """
+        if layout is self.layout:
             return self
-        layout = self.layout.extended(dims)
+        if not layout.begins_with(self.layout):
+            raise ValueError("the layout has other variables first")
         n, m = self.layout.size, layout.size
         Rd = np.zeros((m + 1, m + 1), order="F")
         Rd[:n, :n] = self.R
@@ -234,7 +253,7 @@ class SquareRootInformation:
         w = count * b
         if w == 0:
             return self
-        inverse = np.asfortranarray(np.tril(_transposed_inverse(self.R[:w, :w])))  # R₁₁⁻ᵀ
+        inverse = np.asfortranarray(np.tril(transposed_inverse(self.R[:w, :w])))  # R₁₁⁻ᵀ
         covariance = blas.dsyrk(1.0, inverse, trans=1, lower=1)
         blocks = np.arange(w).reshape(count, b)
         covariance[blocks[:, :, None], blocks[:, None, :]] += noise
@@ -256,7 +275,7 @@ class SquareRootInformation:
             numpy.linalg.LinAlgError: if some direction is not determined.
         """
         # with the last row, which LAPACK does not read: `R` alone is no block of memory, so a copy
-        return _solved(self.Rd[:, :-1], self.Rd[:, -1])[:-1]
+        return solved(self.Rd[:, :-1], self.Rd[:, -1])[:-1]
 
     def covariance(self) -> FloatArray:
         """The (n, n) covariance R⁻¹ R⁻ᵀ."""
@@ -284,11 +303,11 @@ class SquareRootInformation:
 
     def root_from(self, first: int) -> FloatArray:
         """A root (m, m) of the covariance of all columns from one on, R⁻ᵀ of these."""
-        return _transposed_inverse(self.R[first:, first:])
+        return transposed_inverse(self.R[first:, first:])
 
     def root_covariance(self) -> FloatArray:
         """The (n, n) upper triangular R⁻¹, a root of the covariance."""
-        return np.asarray(np.tril(_transposed_inverse(self.R)).T, dtype=np.float64)
+        return np.asarray(np.tril(transposed_inverse(self.R)).T, dtype=np.float64)
 
     def marginal(self, keep: Sequence[int]) -> SquareRootInformation:
         """The Gaussian over the variables `keep`, in that order, with all others eliminated."""
@@ -328,44 +347,6 @@ class SquareRootInformation:
                 place += 1
             columns += dim
         return columns
-
-
-def _solved(R: FloatArray, d: FloatArray) -> FloatArray:
-    """The solution of R x = d for an upper triangular R; rows below its last column are not read.
-
-    As many values follow the solution as there are such rows.
-    """
-    if len(d) == 0:
-        return np.zeros(0)
-    x, info = lapack.dtrtrs(R, d)
-    if info != 0 or not np.isfinite(x).all():
-        raise np.linalg.LinAlgError("the cost does not determine all of its variables")
-    return np.asarray(x, dtype=np.float64)
-
-
-def _transposed_inverse(R: FloatArray) -> FloatArray:
-    """R⁻ᵀ of an upper triangular (n, n) matrix; what is below its diagonal may be anything.
-
-    By the inverses of its halves and triangular products of these, which take half of the time of
-    LAPACK's `dtrtri` for a few hundred columns. What is above the diagonal of the result is zero
-    but for small matrices.
-
-    Raises:
-        numpy.linalg.LinAlgError: if it is singular.
-    """
-    n = len(R)
-    if n <= _SMALL_TRIANGLE:
-        small, info = lapack.dtrtri(R.T, lower=1)
-        if info != 0:
-            raise np.linalg.LinAlgError("the information is singular")
-        return np.asarray(small, dtype=np.float64)
-    half = n // 2
-    inverse = np.zeros((n, n), order="F")
-    inverse[:half, :half] = first = _transposed_inverse(R[:half, :half])
-    inverse[half:, half:] = second = _transposed_inverse(R[half:, half:])
-    corner = blas.dtrmm(-1.0, second, R[:half, half:].T, lower=1)
-    inverse[half:, :half] = blas.dtrmm(1.0, first, corner, side=1, lower=1, overwrite_b=1)
-    return inverse
 
 
 def triangularize(Ab: FloatArray) -> FloatArray:

@@ -302,6 +302,12 @@ class State:
         self._frozen.update(others)
         self.points = self.points.with_frozen(features)
 
+    def freeze_all_of(self, layout: Layout) -> None:
+        """The same of the variables of a layout."""
+        parts = LayoutParts.of(layout)
+        self._frozen.update(parts.keys)
+        self.points = self.points.with_frozen(parts.features)
+
     def rebase(self) -> None:
         """Move all linearisation points to the estimates, the frozen ones too."""
         self._frozen.clear()
