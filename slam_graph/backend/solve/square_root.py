@@ -12,15 +12,15 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cached_property
 from itertools import accumulate, islice
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import blas, lapack
 
-from slam_graph.arrays import BoolArray, FloatArray
-from slam_graph.backend.solve.triangles import solved, transposed_inverse
+from slam_graph.arrays import FloatArray
+from slam_graph.backend.solve.triangles import solved, transposed_inverse, upper_part
 from slam_graph.kernels.elimination import eliminate_columns, zeros_to_the_left
 
 _BLOCK_SIZE = 16
@@ -352,8 +352,10 @@ class SquareRootInformation:
 def triangularize(Ab: FloatArray) -> FloatArray:
     """The upper triangular factor of a QR decomposition of (m, n) rows, always (n, n)."""
     n = Ab.shape[1]
-    triangle = np.zeros((n, n), order="F")
     rows = trapezoidal(Ab)
+    if len(rows) == n:
+        return rows
+    triangle = np.zeros((n, n), order="F")
     triangle[: len(rows)] = rows
     return triangle
 
@@ -365,11 +367,4 @@ def trapezoidal(Ab: FloatArray) -> FloatArray:
     qr, _, _, info = lapack.dgeqrf(np.asfortranarray(Ab))
     if info != 0:
         raise ValueError(f"LAPACK's geqrf rejected argument {-info}")
-    m, n = Ab.shape
-    return np.where(upper_triangle(n)[:m], qr[:n], 0.0)
-
-
-@lru_cache(maxsize=64)
-def upper_triangle(n: int) -> BoolArray:
-    """(n, n) where an upper triangle is."""
-    return np.asfortranarray(np.tri(n, dtype=np.bool_).T)
+    return upper_part(qr[: Ab.shape[1]])
