@@ -212,7 +212,7 @@ class CostConstruction:
         ids: IntArray = window.state_features[is_in(window.state_features, waiting)]
         if self.policy.keep_lost_features or not len(ids):
             return ids
-        points, first = state.positions_of(ids), state.positions_of(ids, first=True)
+        points, first = state.both_positions_of(ids)
         (R,), (p,) = state.poses([window.frame])
         centres = p + self.rig.body_p_camera @ R.T
         away = np.add.reduce((points[:, None] - centres) ** 2, axis=2).min(axis=1)

@@ -212,10 +212,12 @@ def whiten(
     residuals, depths = rig.residuals(obs, estimate)
     by_pose, by_point, by_calibration = rig.all_jacobians(obs, first)
     errors = np.sqrt(np.einsum("ni,ni->n", residuals, residuals)) / sigma_px
-    weight = np.sqrt(loss.weights(errors)) / sigma_px
-    residuals *= weight[:, None]  # all of these are new arrays
-    for derivatives in (by_pose, by_point, by_calibration):
-        derivatives *= weight[:, None, None]
+    weight = (np.sqrt(loss.weights(errors)) / sigma_px)[:, None, None]
+    residuals *= weight[:, 0]  # all of these are new arrays
+    by_pose *= weight
+    by_point *= weight
+    if by_calibration.size:
+        by_calibration *= weight
     return WhitenedObservations(residuals, by_pose, by_point, by_calibration, depths, errors)
 
 

@@ -218,7 +218,18 @@ class State:
             KeyError: if one is not a variable.
         """
         rows = self.points.rows(features)
-        return (self.points.first if first else self.points.estimate)[rows]
+        places = self.points.first.take(rows, axis=0)
+        return places if first else places + self.points.offsets.take(rows, axis=0)
+
+    def both_positions_of(self, features: IntArray) -> tuple[FloatArray, FloatArray]:
+        """Positions (N, 3) of some features, and their first estimates.
+
+        Raises:
+            KeyError: if one is not a variable.
+        """
+        rows = self.points.rows(features)
+        first = self.points.first.take(rows, axis=0)
+        return first + self.points.offsets.take(rows, axis=0), first
 
     def offset(self, layout: Layout) -> FloatArray:
         """Stacked offset (n,) of the estimates from the linearisation points."""
