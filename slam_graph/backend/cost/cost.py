@@ -167,13 +167,10 @@ class Cost:
 
     def prior_at_estimate(self) -> SquareRootInformation:
         """The prior as a function of an increment of the current estimates."""
-        prior, layout = self.prior, self.layout()
-        n, m = prior.layout.size, layout.size
-        Rd = np.zeros((m + 1, m + 1), order="F")
-        Rd[:n, :n] = prior.R
-        Rd[:n, m] = prior.d - prior.R @ self.state.offset(prior.layout)
-        Rd[m, m] = prior.Rd[n, n]
-        return SquareRootInformation(layout, Rd)
+        prior = self.prior
+        there = prior.over(self.layout(), copy=True)
+        there.Rd[: prior.layout.size, -1] -= prior.R @ self.state.offset(prior.layout)
+        return there
 
     def part(self, factors: Sequence[gtsam.NonlinearFactor], tracks: BoolArray) -> Cost:
         """The prior and the features of the state, with some of the factors and new features (J,).

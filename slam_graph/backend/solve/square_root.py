@@ -25,6 +25,8 @@ from slam_graph.kernels.elimination import eliminate_columns, zeros_to_the_left
 
 _BLOCK_SIZE = 16
 """Width of the blocks of LAPACK's triangular-pentagonal QR."""
+_FEW_KEYS = 8
+"""Columns of so few variables are counted one by one."""
 
 
 class Layout:
@@ -77,15 +79,16 @@ class Layout:
         return known
 
     def _columns_of(self, chosen: tuple[int, ...]) -> NDArray[np.intp]:
-        starts = list(map(self.starts.__getitem__, chosen))
-        sizes = list(map(self.dims.__getitem__, chosen))
-        if sizes and sizes.count(sizes[0]) == len(sizes):  # of poses, mostly
-            columns = np.array(starts, np.intp)[:, None] + np.arange(sizes[0])
-            return np.asarray(columns.ravel(), np.intp)
-        widths = np.array(sizes, np.intp)
-        ends = widths.cumsum()
-        shifts = np.array(starts, np.intp) - (ends - widths)
-        return np.arange(sum(sizes), dtype=np.intp) + shifts.repeat(widths)
+        if len(chosen) <= _FEW_KEYS:  # arrays of them take longer
+            columns: list[int] = []
+            for key in chosen:
+                columns += range(start := self.starts[key], start + self.dims[key])
+            return np.array(columns, np.intp)
+        starts = np.array(list(map(self.starts.__getitem__, chosen)), np.intp)
+        sizes = np.array(list(map(self.dims.__getitem__, chosen)), np.intp)
+        ends = sizes.cumsum()
+        shifts = starts - (ends - sizes)
+        return np.arange(ends[-1], dtype=np.intp) + shifts.repeat(sizes)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -170,19 +173,23 @@ class SquareRootInformation:
         """The same Gaussian with further variables of which nothing is known."""
         return self.over(self.layout.extended(dims)) if dims else self
 
-    def over(self, layout: Layout) -> SquareRootInformation:
+    def over(self, layout: Layout, copy: bool = False) -> SquareRootInformation:
         """The same Gaussian over a layout that begins with its own: of the rest nothing is known.
 
+        Args:
+            layout: of all variables.
+            copy: whether it is to have memory of its own in any case.
+
         Raises:
-            ValueError: if it does not.
+            ValueError: if the layout has other variables first.
         """
-        if layout is self.layout:
+        if layout is self.layout and not copy:
             return self
-        if not layout.begins_with(self.layout):
+        if layout is not self.layout and not layout.begins_with(self.layout):
             raise ValueError("the layout has other variables first")
         n, m = self.layout.size, layout.size
-        Rd = np.zeros((m + 1, m + 1), order="F")
-        Rd[:n, :n] = self.R
+        Rd = np.empty((m + 1, m + 1), order="F")  # to fill all of it with zeros takes as long again
+        Rd[:n, :n], Rd[:n, n:m], Rd[n:] = self.R, 0.0, 0.0
         Rd[:n, m] = self.d
         Rd[m, m] = self.Rd[n, n]
         return SquareRootInformation(layout, Rd)

@@ -45,7 +45,8 @@ def transposed_inverse(R: FloatArray) -> FloatArray:
             raise np.linalg.LinAlgError("the information is singular")
         return np.asarray(small, dtype=np.float64)
     half = n // 2
-    inverse = np.zeros((n, n), order="F")
+    inverse = np.empty((n, n), order="F")
+    inverse[:half, half:] = 0.0
     inverse[:half, :half] = first = transposed_inverse(R[:half, :half])
     inverse[half:, half:] = second = transposed_inverse(R[half:, half:])
     corner = blas.dtrmm(-1.0, second, R[:half, half:].T, lower=1)
