@@ -94,8 +94,8 @@ def visual_rotation(
     guess: FloatArray | None,
 ) -> VisualRotation | None:
     """The rotation between two frames of a camera, as `rotation_between` finds it."""
-    bearings = (Bearings.of(seen, camera, pixel_sigma) for seen in (one, two))
-    return rotation_between(*bearings, guess)
+    first, second = (Bearings.of(seen, camera, pixel_sigma) for seen in (one, two))
+    return rotation_between(first, second, guess)
 
 
 def rotation_between(

@@ -59,7 +59,8 @@ class LayoutParts:
 
     def _extended(self, layout: Layout) -> LayoutParts:
         """The parts of a layout that begins with the one of these and has a few variables more."""
-        keys, slices, of_others = self.keys.copy(), self.slices.copy(), []
+        keys, slices = self.keys.copy(), self.slices.copy()
+        of_others: list[int] = []
         features, starts = [], []
         begin, end = len(self.of_others) + self.of_points.size, len(self.of_others)
         for key, dim in islice(layout.dims.items(), len(keys) + len(self.features), None):

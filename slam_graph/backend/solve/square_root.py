@@ -87,8 +87,8 @@ class Layout:
         starts = np.array(list(map(self.starts.__getitem__, chosen)), np.intp)
         sizes = np.array(list(map(self.dims.__getitem__, chosen)), np.intp)
         ends = sizes.cumsum()
-        shifts = starts - (ends - sizes)
-        return np.arange(ends[-1], dtype=np.intp) + shifts.repeat(sizes)
+        shifts = (starts - (ends - sizes)).repeat(sizes)
+        return np.asarray(np.arange(len(shifts)) + shifts, dtype=np.intp)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
