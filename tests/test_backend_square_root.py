@@ -7,6 +7,7 @@ import pytest
 
 from slam_graph.arrays import FloatArray
 from slam_graph.backend.solve.square_root import Layout, SquareRootInformation, triangularize
+from slam_graph.backend.solve.triangles import upper_part
 
 DIMS = {10: 3, 11: 6, 12: 1, 13: 3, 14: 2}
 SIZE = sum(DIMS.values())
@@ -180,6 +181,16 @@ def test_an_extension_adds_variables_of_which_nothing_is_known() -> None:
     np.testing.assert_allclose(wide.updated(rows).solution(), mean, atol=1e-9)
     np.testing.assert_allclose(wide.updated(rows).covariance(), covariance, atol=1e-9)
     assert gauss.extended({}) is gauss
+    with pytest.raises(ValueError, match="other variables first"):
+        gauss.over(Layout({20: 2, **DIMS}))
+
+
+@pytest.mark.parametrize("shape", [(3, 7), (7, 7), (0, 4)])
+def test_upper_parts_whatever_is_below(shape: tuple[int, int]) -> None:
+    values = np.asfortranarray(np.random.default_rng(7).normal(size=shape))
+    expected = np.triu(values)
+    values[np.tril_indices(len(values), -1, shape[1])] = np.nan
+    assert np.array_equal(upper_part(values), expected)
 
 
 def test_knowledge_can_grow_from_nothing() -> None:

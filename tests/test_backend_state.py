@@ -69,9 +69,14 @@ def test_poses_are_those_of_the_values(state: State) -> None:
                 assert all(np.array_equal(a, b) for a, b in zip(found, expected, strict=True))
         state.update(layout(keys), delta(keys))
         state.relinearize()
+    state.poses([0]), state.poses([0], first=True)  # known when poses come and go
     state.insert_imu_state(2, Flight().nav_state(0.6))
     state.remove(imu_state_keys(0))
-    assert np.array_equal(state.poses([2, 1])[1], stacked_poses(state.frames, [2, 1])[1])
+    for first, values in ((False, state.frames), (True, state.first_frames)):
+        found, expected = state.poses([2, 1], first), stacked_poses(values, [2, 1])
+        assert all(np.array_equal(a, b) for a, b in zip(found, expected, strict=True))
+    state.insert_imu_state(0, Flight().nav_state(0.0))  # not the last one
+    assert np.array_equal(state.poses([0, 2])[1], stacked_poses(state.frames, [0, 2])[1])
 
 
 def test_parts_of_a_layout() -> None:
@@ -87,10 +92,25 @@ def test_parts_of_a_layout() -> None:
     assert np.array_equal(parts.stacked(tangents), of_others)
 
 
+def test_an_extended_layout_is_that_of_all_its_variables() -> None:
+    """Columns and parts, also where it was extended twice."""
+    whole = layout([*KEYS, X(2), L(3), T(0), L(9)])
+    extended = layout(KEYS).extended(dims_of([X(2), L(3)])).extended(dims_of([T(0), L(9)]))
+    assert extended.begins_with(layout(KEYS))
+    assert not extended.begins_with(layout([X(0)]))
+    assert extended.dims == whole.dims
+    assert extended.starts == whole.starts
+    found, expected = LayoutParts.of(extended), LayoutParts.of(whole)
+    assert (found.keys, found.slices) == (expected.keys, expected.slices)
+    for name in ("of_others", "features", "of_points"):
+        assert np.array_equal(getattr(found, name), getattr(expected, name))
+
+
 def test_columns_are_in_the_order_of_the_keys() -> None:
-    """Of variables of one size and of several."""
-    columns = layout(KEYS)
-    for keys in ([X(1), X(0)], [B(1), L(5), X(0)], [V(1)], []):
+    """Of variables of one size and of several, of few and of many."""
+    columns = layout([*KEYS, *(L(k) for k in range(20, 30))])
+    many = [L(k) for k in range(29, 19, -1)]
+    for keys in ([X(1), X(0)], [B(1), L(5), X(0)], [V(1)], [], [X(1), *many, V(1)]):
         expected = [c for key in keys for c in range(*columns.columns[key].indices(columns.size))]
         assert columns.indices(keys).tolist() == expected
 

@@ -9,6 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from slam_graph.kernels.ascending import are_among, are_among_numpy
+from slam_graph.kernels.chained_turns import chain_turns, chain_turns_numpy
 from slam_graph.kernels.elimination import (
     eliminate_columns,
     eliminate_columns_numpy,
@@ -345,6 +346,15 @@ def test_are_among(count: int) -> None:
     found = are_among(values, ascending)
     assert np.array_equal(found, are_among_numpy(values, ascending))
     assert found.any() == (count > 0)
+
+
+@pytest.mark.parametrize("count", [0, 1, 200])
+def test_chain_turns(count: int) -> None:
+    turns = Rotation.from_rotvec(np.random.default_rng(10).normal(size=(count, 3))).as_matrix()
+    found = np.empty((2, count + 1, 3, 3))
+    chain_turns(turns, found[0])
+    chain_turns_numpy(turns, found[1])
+    assert same(*found)
 
 
 def test_epipolar_constraint() -> None:

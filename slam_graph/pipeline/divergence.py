@@ -10,10 +10,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from slam_graph.arrays import IntArray, ascending_union
+from slam_graph.arrays import IntArray
 from slam_graph.config import RunConfig
 from slam_graph.errors import EstimationError
 from slam_graph.geometry import NavState
+from slam_graph.kernels.ascending import are_among
 from slam_graph.sensors import FeatureFrame
 
 _KNOWN_VELOCITY, _LESS_KNOWN = 0.5, 3.0
@@ -209,7 +210,7 @@ class Corrections:
         ids = frame.ids
         if not len(ids):
             return
-        again = len(self._ids) + len(ids) - len(ascending_union(self._ids, ids))
+        again = np.count_nonzero(are_among(self._ids, ids))
         if again < _FOUND_AGAIN * len(self._ids):
             self._broken_ns = frame.stamp_ns
         self._ids = ids

@@ -7,6 +7,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import chain
 
 import numpy as np
 
@@ -68,13 +69,13 @@ class _Kept:
 
     Attributes:
         features: what was found in it.
-        known: what came with it, and with the frames since the one before.
+        known: what came with the frames since the one before, and with it.
         judged: whether it was known what moves by itself: there was a state, or no objects are
             estimated.
     """
 
     features: FeatureFrame
-    known: _Known
+    known: list[_Known]
     judged: bool
 
 
@@ -132,12 +133,14 @@ class KeptFrames:
         return [kept.features.without(self._objects.moved) for kept in judged]
 
     def _known(self) -> _Known:
-        return _Known.of_all([*(kept.known for kept in self._frames), *self._since])
+        kept = chain.from_iterable(kept.known for kept in self._frames)
+        return _Known.of_all([*kept, *self._since])
 
     @property
     def imu(self) -> ImuData:
         """All samples between them."""
-        return ImuData.concatenate([kept.known.imu for kept in self._frames])
+        kept = chain.from_iterable(kept.known for kept in self._frames)
+        return ImuData.concatenate([known.imu for known in kept])
 
     @property
     def pairs(self) -> list[CameraFrame]:
@@ -158,7 +161,7 @@ class KeptFrames:
         if frames and stamp_ns - frames[-1].features.stamp_ns < SPACING_NS:
             return
         judged = frame.objects is None or frame.state is not None
-        frames.append(_Kept(frame.features, _Known.of_all(self._since), judged))
+        frames.append(_Kept(frame.features, self._since, judged))
         self._since = []
         while frames[0].features.stamp_ns < stamp_ns - KEPT_NS:
             frames.popleft()

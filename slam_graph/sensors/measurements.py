@@ -80,11 +80,10 @@ class ImuData:
     @staticmethod
     def chained(turns: FloatArray) -> FloatArray:
         """Rotations start_R_body (N + 1, 3, 3) at samples from those (N, 3, 3) between them."""
+        from slam_graph.kernels.chained_turns import chain_turns  # which loads kernels
+
         rotations = np.empty((len(turns) + 1, 3, 3))
-        rotations[0] = np.eye(3)
-        rows = list(rotations)  # views; and `dot` into one of them takes half of the time of `@`
-        for before, turn, after in zip(rows[:-1], turns, rows[1:], strict=True):
-            np.dot(before, turn, after)
+        chain_turns(np.ascontiguousarray(turns), rotations)
         return rotations
 
     def preintegrated(

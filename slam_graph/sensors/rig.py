@@ -25,6 +25,8 @@ _STAMPED_ROWS = {"first": 0.0, "middle": 0.5, "last": 1.0}
 
 _INTEGRATION_SIGMA = 1e-5
 """Error of the position integration itself, m/√s; it keeps the preintegrated covariance regular."""
+_UNIT = np.eye(3)
+_INTEGRATION_COVARIANCE = _UNIT * _INTEGRATION_SIGMA**2
 
 
 @dataclass(frozen=True)
@@ -61,14 +63,13 @@ class ImuNoise:
             accel_scale: factor on that of the accelerometer.
         """
         params = gtsam.PreintegrationCombinedParams.MakeSharedU(gravity)
-        eye = np.eye(3)
         gyro = scale * gyro_scale * self.gyro_noise_density
         accel = scale * accel_scale * self.accel_noise_density
-        params.setGyroscopeCovariance(eye * gyro**2)
-        params.setAccelerometerCovariance(eye * accel**2)
-        params.setBiasOmegaCovariance(eye * (scale * self.gyro_random_walk) ** 2)
-        params.setBiasAccCovariance(eye * (scale * self.accel_random_walk) ** 2)
-        params.setIntegrationCovariance(eye * _INTEGRATION_SIGMA**2)
+        params.setGyroscopeCovariance(_UNIT * gyro**2)
+        params.setAccelerometerCovariance(_UNIT * accel**2)
+        params.setBiasOmegaCovariance(_UNIT * (scale * self.gyro_random_walk) ** 2)
+        params.setBiasAccCovariance(_UNIT * (scale * self.accel_random_walk) ** 2)
+        params.setIntegrationCovariance(_INTEGRATION_COVARIANCE)
         return params
 
 

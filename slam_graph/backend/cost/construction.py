@@ -40,7 +40,7 @@ from slam_graph.backend.cost.selection_policies import (
 )
 from slam_graph.backend.policies import CostPolicy
 from slam_graph.backend.solve.square_root import SquareRootInformation
-from slam_graph.backend.solve.state import POINT_DIM
+from slam_graph.backend.solve.state import POINT_DIM, State
 from slam_graph.backend.window import Window
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import EstimationError
@@ -159,7 +159,7 @@ class CostConstruction:
         poses = self._selected_poses(window)
         rows = cost.factor_rows(cost.layout())
         predicted = cost.prior_at_estimate().updated(rows, overwrite=True, overwrite_rows=True)
-        in_state = self._measured_again(window)
+        in_state = self._measured_again(window, cost.state)
         cost.landmarks = window.tracks.observations(in_state)
         cost.tracks = self._selection.new_features(
             window, cost.state, poses, len(in_state), self._dynamic, removals
@@ -201,7 +201,7 @@ class CostConstruction:
         cost.sigma_px = self.pixels.sigma_px
         return cost
 
-    def _measured_again(self, window: Window) -> IntArray:
+    def _measured_again(self, window: Window, state: State) -> IntArray:
         """The features of the state, ascending, that are measured in the current frame.
 
         Where an estimate is far from its linearisation point, the Jacobian there is wrong and would
@@ -212,8 +212,7 @@ class CostConstruction:
         ids: IntArray = window.state_features[is_in(window.state_features, waiting)]
         if self.policy.keep_lost_features or not len(ids):
             return ids
-        state = window.state
-        points, first = state.positions_of(ids), state.positions_of(ids, first=True)
+        points, first = state.both_positions_of(ids)
         (R,), (p,) = state.poses([window.frame])
         centres = p + self.rig.body_p_camera @ R.T
         away = np.add.reduce((points[:, None] - centres) ** 2, axis=2).min(axis=1)

@@ -167,13 +167,10 @@ class Cost:
 
     def prior_at_estimate(self) -> SquareRootInformation:
         """The prior as a function of an increment of the current estimates."""
-        prior, layout = self.prior, self.layout()
-        n, m = prior.layout.size, layout.size
-        Rd = np.zeros((m + 1, m + 1), order="F")
-        Rd[:n, :n] = prior.R
-        Rd[:n, m] = prior.d - prior.R @ self.state.offset(prior.layout)
-        Rd[m, m] = prior.Rd[n, n]
-        return SquareRootInformation(layout, Rd)
+        prior = self.prior
+        there = prior.over(self.layout(), copy=True)
+        there.Rd[: prior.layout.size, -1] -= prior.R @ self.state.offset(prior.layout)
+        return there
 
     def part(self, factors: Sequence[gtsam.NonlinearFactor], tracks: BoolArray) -> Cost:
         """The prior and the features of the state, with some of the factors and new features (J,).
@@ -226,6 +223,7 @@ class Cost:
             points: in the world.
         """
         rig = self.rig.at(self.state)
+        points = self.state.positions_of(obs.ids) if points is None else points
         residuals, _ = rig.residuals(obs, self._geometry(rig, obs, points))
         squares = np.einsum("ni,ni->n", residuals, residuals)
         return np.asarray(squares / self.sigmas(obs) ** 2, dtype=np.float64)
@@ -250,21 +248,17 @@ class Cost:
         )
 
     def _whitened(self, obs: Observations, points: FloatArray | None) -> WhitenedObservations:
-        rig = self.rig.at(self.state)
-        first = self._geometry(rig, obs, points, first=True)
-        estimate = self._geometry(rig, obs, points)
+        rig, now, then = self.rig.at(self.state), points, points
+        if now is None or then is None:
+            now, then = self.state.both_positions_of(obs.ids)
+        first = self._geometry(rig, obs, then, first=True)
+        estimate = self._geometry(rig, obs, now)
         return whiten(obs, rig, first, estimate, self.sigmas(obs), self.robust)
 
     def _geometry(
-        self,
-        rig: RigProjection,
-        obs: Observations,
-        points: FloatArray | None,
-        first: bool = False,
+        self, rig: RigProjection, obs: Observations, points: FloatArray, first: bool = False
     ) -> Geometry:
-        """Poses and points of observations; the points of features of the state if not given."""
-        if points is None:
-            points = self.state.positions_of(obs.ids, first)
+        """Poses, or their first estimates, and points of observations."""
         poses = self.state.poses(obs.frames, first)
         return Geometry(*rig.when_taken(obs.frames, *poses), points)
 

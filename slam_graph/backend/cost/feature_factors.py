@@ -38,8 +38,8 @@ from slam_graph.arrays import FloatArray
 from slam_graph.backend.cost.feature_tracks import Observations
 from slam_graph.backend.cost.reprojection import Geometry, RigProjection
 from slam_graph.backend.cost.robust_loss import RobustLoss
-from slam_graph.backend.solve.square_root import upper_triangle
 from slam_graph.backend.solve.state import POSE_DIM
+from slam_graph.backend.solve.triangles import upper_part
 from slam_graph.kernels.feature_sums import sum_of_features
 from slam_graph.kernels.null_space import triangularize_features
 
@@ -105,7 +105,7 @@ def information_root(information: FloatArray) -> FloatArray:
     root, pivots = root[:rank], pivots - 1
     b, _ = lapack.dtrtrs(root[:, :rank], information[pivots[:rank], n], trans=1)
     rows = np.zeros((rank + 1, n + 1))
-    rows[:rank, pivots] = np.where(upper_triangle(n)[:rank], root, 0.0)
+    rows[:rank, pivots] = upper_part(root)
     rows[:rank, n] = b
     rows[rank, n] = np.sqrt(max(information[n, n] - b @ b, 0.0))
     return rows
@@ -212,10 +212,12 @@ def whiten(
     residuals, depths = rig.residuals(obs, estimate)
     by_pose, by_point, by_calibration = rig.all_jacobians(obs, first)
     errors = np.sqrt(np.einsum("ni,ni->n", residuals, residuals)) / sigma_px
-    weight = np.sqrt(loss.weights(errors)) / sigma_px
-    residuals *= weight[:, None]  # all of these are new arrays
-    for derivatives in (by_pose, by_point, by_calibration):
-        derivatives *= weight[:, None, None]
+    weight = (np.sqrt(loss.weights(errors)) / sigma_px)[:, None, None]
+    residuals *= weight[:, 0]  # all of these are new arrays
+    by_pose *= weight
+    by_point *= weight
+    if by_calibration.size:
+        by_calibration *= weight
     return WhitenedObservations(residuals, by_pose, by_point, by_calibration, depths, errors)
 
 

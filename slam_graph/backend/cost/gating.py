@@ -58,11 +58,10 @@ class Innovations:
         """
         entered, passed_dof = distances[passed], dof[passed]
         counts = np.bincount(passed_dof)
-        degrees, limits = counts.nonzero()[0], np.empty(len(counts))
-        limits[passed_dof] = largest[passed]
-        numbers = counts[degrees]
-        kinds = zip(degrees.tolist(), limits[degrees].tolist(), strict=True)
-        means = np.array([_mean_below(*kind) for kind in kinds])
+        degrees = counts.nonzero()[0]
+        numbers, kinds = counts[degrees], degrees.tolist()
+        limits = dict(zip(passed_dof.tolist(), largest[passed].tolist(), strict=True))
+        means = np.array([_mean_below(k, limits[k]) for k in kinds])
         return Innovations(
             len(distances),
             len(distances) - len(entered),
@@ -80,6 +79,8 @@ class Innovations:
         return Innovations(passed_dof=total, expected=float(total))
 
     def __add__(self, other: Innovations) -> Innovations:
+        if not self.tested and not self.passed_dof:
+            return other
         return Innovations(*(getattr(self, name) + getattr(other, name) for name in self.__slots__))
 
 

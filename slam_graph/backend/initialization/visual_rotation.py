@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from slam_graph.arrays import FloatArray
+from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.kernels.epipolar_rotation import refine_rotation
 from slam_graph.sensors import Camera, FeatureObservations
 
@@ -49,6 +49,43 @@ class VisualRotation:
     information: FloatArray
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Bearings:
+    """Bearings of the features of one frame: they are used for several pairs.
+
+    Attributes:
+        ids: (N,) of the features.
+        normalized: (N, 2) on the plane z = 1.
+        rays: (N, 3) unit bearings.
+        sigmas: (N,) their noise, rad, by the area of a pixel on the sphere.
+        plane_sigma: the noise on the plane z = 1, in the middle of the image.
+    """
+
+    ids: IntArray
+    normalized: FloatArray
+    rays: FloatArray
+    sigmas: FloatArray
+    plane_sigma: float
+
+    @staticmethod
+    def of(seen: FeatureObservations, camera: Camera, pixel_sigma: float) -> Bearings:
+        """Those of the features that a camera sees.
+
+        Args:
+            seen: the features.
+            camera: which sees them.
+            pixel_sigma: standard deviation of an observation, pixels.
+        """
+        rays = np.column_stack([seen.normalized, np.ones(len(seen))])
+        length = np.linalg.norm(rays, axis=1)
+        slopes = camera.distort(seen.normalized)[1]
+        area = slopes[:, 0, 0] * slopes[:, 1, 1] - slopes[:, 0, 1] * slopes[:, 1, 0]
+        pixels = np.abs(area) * length**3
+        sigmas = pixel_sigma / np.sqrt(np.maximum(pixels, _TINY))
+        rays /= length[:, None]
+        return Bearings(seen.ids, seen.normalized, rays, sigmas, pixel_sigma / camera.fx)
+
+
 def visual_rotation(
     one: FeatureObservations,
     two: FeatureObservations,
@@ -56,27 +93,32 @@ def visual_rotation(
     pixel_sigma: float,
     guess: FloatArray | None,
 ) -> VisualRotation | None:
+    """The rotation between two frames of a camera, as `rotation_between` finds it."""
+    first, second = (Bearings.of(seen, camera, pixel_sigma) for seen in (one, two))
+    return rotation_between(first, second, guess)
+
+
+def rotation_between(
+    one: Bearings, two: Bearings, guess: FloatArray | None
+) -> VisualRotation | None:
     """The rotation between two frames of a camera; None without enough features.
 
     Args:
         one: features of the first frame.
         two: those of the second.
-        camera: which sees them.
-        pixel_sigma: standard deviation of an observation, pixels.
         guess: (3, 3) a rotation near; without it that of the bearings is taken, as if the camera
             only turned.
     """
     _, i, j = np.intersect1d(one.ids, two.ids, assume_unique=True, return_indices=True)
     if len(i) < MIN_COMMON:
         return None
-    first, sigma_1 = _bearings(one.normalized[i], camera, pixel_sigma)
-    second, sigma_2 = _bearings(two.normalized[j], camera, pixel_sigma)
-    variances = np.column_stack([sigma_1, sigma_2]) ** 2
+    first, second = one.rays[i], two.rays[j]
+    variances = np.column_stack([one.sigmas[i], two.sigmas[j]]) ** 2
     best = None if guess is None else _refined(first, second, variances, guess)
     if best is None or best[0] > _SEARCH_COST * len(i):
         # there are local minima, and no start is known to be near the global one
         starts = [Rotation.align_vectors(first, second)[0].as_matrix()]
-        starts += _by_five_points(one.normalized[i], two.normalized[j], pixel_sigma / camera.fx)
+        starts += _by_five_points(one.normalized[i], two.normalized[j], one.plane_sigma)
         found = [_refined(first, second, variances, R) for R in starts]
         best = min(found if best is None else [best, *found], key=_cost)
     return None if best[0] > _MAX_COST * len(i) else best[1]
@@ -96,18 +138,6 @@ def _by_five_points(one: FloatArray, two: FloatArray, noise: float) -> list[Floa
     # the other of the two turns by another half turn about the translation
     smaller = R_1 if np.trace(R_1) > np.trace(R_2) else R_2
     return [np.asarray(smaller.T, np.float64)]
-
-
-def _bearings(
-    normalized: FloatArray, camera: Camera, pixel_sigma: float
-) -> tuple[FloatArray, FloatArray]:
-    """Unit bearings (N, 3) and their noise (N,), rad, by the area of a pixel on the sphere."""
-    rays = np.column_stack([normalized, np.ones(len(normalized))])
-    length = np.linalg.norm(rays, axis=1)
-    slopes = camera.distort(normalized)[1]
-    area = slopes[:, 0, 0] * slopes[:, 1, 1] - slopes[:, 0, 1] * slopes[:, 1, 0]
-    pixels = np.abs(area) * length**3
-    return rays / length[:, None], pixel_sigma / np.sqrt(np.maximum(pixels, _TINY))
 
 
 def _refined(

@@ -14,7 +14,11 @@ from scipy.spatial.transform import Rotation
 from slam_graph.arrays import FloatArray
 from slam_graph.backend.cost.feature_tracks import is_in
 from slam_graph.backend.initialization.gyro_alignment import MAX_OFFSET_S, MIN_TURNS, Turns
-from slam_graph.backend.initialization.visual_rotation import MIN_COMMON, visual_rotation
+from slam_graph.backend.initialization.visual_rotation import (
+    MIN_COMMON,
+    Bearings,
+    rotation_between,
+)
 from slam_graph.sensors import FeatureFrame, ImuBuffer, ImuData, RigCamera
 
 _BASELINE_NS = 400_000_000
@@ -40,7 +44,7 @@ class VisualTurns:
 
     def __init__(self, camera: RigCamera, pixel_sigma: float) -> None:
         self._camera, self._pixel_sigma = camera, pixel_sigma
-        self._frames: deque[FeatureFrame] = deque()
+        self._frames: deque[tuple[int, Bearings]] = deque()  # by their stamps
         self._turns: deque[tuple[int, int, FloatArray, FloatArray]] = deque()
         self.seen = 0
 
@@ -67,8 +71,10 @@ class VisualTurns:
             keep_last: whether a rotation may be over up to twice the usual time, if there is no
                 other frame: where the spacing is nearly as long as that.
         """
-        if not self._frames or frame.stamp_ns - self._frames[-1].stamp_ns >= spacing_ns:
-            self._add(self._unrolled(frame, imu) if mounted else frame, keep_last)
+        if not self._frames or frame.stamp_ns - self._frames[-1][0] >= spacing_ns:
+            seen = (self._unrolled(frame, imu) if mounted else frame).cameras[0]
+            bearings = Bearings.of(seen, self._camera.camera, self._pixel_sigma)
+            self._add(frame.stamp_ns, bearings, keep_last)
 
     def _unrolled(self, frame: FeatureFrame, imu: ImuBuffer) -> FeatureFrame:
         """The frame with the first camera's bearings at the time of its middle row."""
@@ -89,34 +95,32 @@ class VisualTurns:
         turned = replace(seen, normalized=normalized)
         return FeatureFrame(frame.stamp_ns, (turned, *frame.cameras[1:]))
 
-    def _add(self, frame: FeatureFrame, keep_last: bool) -> None:
+    def _add(self, stamp_ns: int, now: Bearings, keep_last: bool) -> None:
         """The rotation since the oldest frame with enough of the same features."""
         while self._frames:
             longest_ns = 2 * _BASELINE_NS if keep_last and len(self._frames) == 1 else _BASELINE_NS
-            if frame.stamp_ns - self._frames[0].stamp_ns <= longest_ns:
+            if stamp_ns - self._frames[0][0] <= longest_ns:
                 break
             self._frames.popleft()
-        while self._turns and frame.stamp_ns - self._turns[0][0] > _WINDOW_NS:
+        while self._turns and stamp_ns - self._turns[0][0] > _WINDOW_NS:
             self._turns.popleft()
-        now, model = frame.cameras[0], (self._camera.camera, self._pixel_sigma)
-        for before in self._frames:
-            common = np.count_nonzero(is_in(now.ids, np.sort(before.cameras[0].ids)))
-            if common < (_ENOUGH_COMMON if before is not self._frames[-1] else MIN_COMMON):
+        for before_ns, before in self._frames:
+            common = np.count_nonzero(is_in(now.ids, np.sort(before.ids)))
+            if common < (_ENOUGH_COMMON if before is not self._frames[-1][1] else MIN_COMMON):
                 continue
-            turn = visual_rotation(before.cameras[0], now, *model, self._expected(frame, before))
+            turn = rotation_between(before, now, self._expected(before_ns, stamp_ns))
             if turn is not None:
-                row = (before.stamp_ns, frame.stamp_ns, turn.R, turn.information)
-                self._turns.append(row)
+                self._turns.append((before_ns, stamp_ns, turn.R, turn.information))
                 self.seen += 1
             break
-        self._frames.append(frame)
+        self._frames.append((stamp_ns, now))
 
-    def _expected(self, frame: FeatureFrame, before: FeatureFrame) -> FloatArray | None:
+    def _expected(self, before_ns: int, stamp_ns: int) -> FloatArray | None:
         """The rotation between two frames if the camera turns on as in the last pair."""
         if not self._turns:
             return None
         first_ns, second_ns, R, _ = self._turns[-1]
-        ratio = (frame.stamp_ns - before.stamp_ns) / (second_ns - first_ns)
+        ratio = (stamp_ns - before_ns) / (second_ns - first_ns)
         vector = gtsam.Rot3.Logmap(gtsam.Rot3(R)) * ratio
         return np.asarray(gtsam.Rot3.Expmap(vector).matrix())
 

@@ -194,5 +194,5 @@ def marginalize(
         state.rebase()
     elif points == "corrected":
         prior = relinearized(prior, state)
-    state.freeze(prior.layout.dims)  # the steps to come must not move what the prior is about
+    state.freeze_all_of(prior.layout)  # the steps to come must not move what the prior is about
     return prior.shifted(-state.offset(prior.layout), overwrite=True)

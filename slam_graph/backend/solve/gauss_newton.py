@@ -150,11 +150,8 @@ def _system(
     if predicted is None:
         rows = cost.factor_rows(layout)
         system = cost.prior_at_estimate().updated(rows, overwrite=True, overwrite_rows=True)
-    elif layout is predicted.layout:
-        system = predicted
     else:
-        known = predicted.layout.dims
-        system = predicted.extended({k: d for k, d in layout.dims.items() if k not in known})
+        system = predicted.over(layout)
     for rows in cost.rows(linear, layout):
         system = system.updated(rows, overwrite=system is not predicted, overwrite_rows=True)
     return system

@@ -7,6 +7,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import islice
 
 import numpy as np
 from gtsam.symbol_shorthand import L
@@ -42,6 +43,8 @@ class LayoutParts:
     @lru_cache(maxsize=8)
     def of(layout: Layout) -> LayoutParts:
         """The parts of a layout: one is asked for several times in a step."""
+        if layout.begin is not None:
+            return LayoutParts.of(layout.begin)._extended(layout)
         keys = np.fromiter(layout.dims, np.int64, len(layout.dims))
         dims = np.fromiter(layout.dims.values(), np.int64, len(keys))
         points = keys >> LETTER_SHIFT == _POINT_CODE
@@ -53,6 +56,28 @@ class LayoutParts:
         return LayoutParts(
             keys[rest].tolist(), slices, of_others, keys[points] - FIRST_POINT, columns
         )
+
+    def _extended(self, layout: Layout) -> LayoutParts:
+        """The parts of a layout that begins with the one of these and has a few variables more."""
+        keys, slices = self.keys.copy(), self.slices.copy()
+        of_others: list[int] = []
+        features, starts = [], []
+        begin, end = len(self.of_others) + self.of_points.size, len(self.of_others)
+        for key, dim in islice(layout.dims.items(), len(keys) + len(self.features), None):
+            if key >> LETTER_SHIFT == _POINT_CODE:
+                features.append(key)
+                starts.append(begin)
+            else:
+                keys.append(key)
+                slices.append(slice(end, end := end + dim))
+                of_others += range(begin, begin + dim)
+            begin += dim
+        ids, points = self.features, self.of_points
+        if features:
+            ids = np.concatenate([ids, np.array(features, np.int64) - FIRST_POINT])
+            points = np.concatenate([points, np.array(starts)[:, None] + _POINT_COLUMNS])
+        columns = np.concatenate([self.of_others, np.array(of_others, np.int64)])
+        return LayoutParts(keys, slices, columns, ids, points)
 
     def stacked(self, tangents: dict[int, FloatArray]) -> FloatArray:
         """The tangents (k,) of all variables but features, by their keys, in one vector."""

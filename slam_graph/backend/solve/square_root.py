@@ -12,22 +12,21 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
-from itertools import accumulate, chain
-from operator import add
+from functools import cached_property
+from itertools import accumulate, islice
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import blas, lapack
 
-from slam_graph.arrays import BoolArray, FloatArray
+from slam_graph.arrays import FloatArray
+from slam_graph.backend.solve.triangles import solved, transposed_inverse, upper_part
 from slam_graph.kernels.elimination import eliminate_columns, zeros_to_the_left
 
 _BLOCK_SIZE = 16
 """Width of the blocks of LAPACK's triangular-pentagonal QR."""
-
-_SMALL_TRIANGLE = 64
-"""Triangles up to this size are inverted at once."""
+_FEW_KEYS = 8
+"""Columns of so few variables are counted one by one."""
 
 
 class Layout:
@@ -36,17 +35,24 @@ class Layout:
     Attributes:
         dims: dimension of each key, in the order of the columns.
         size: length of the stacked vector.
+        begin: the layout that this one begins with, if it was made of it.
     """
 
-    def __init__(self, dims: Mapping[int, int]) -> None:
+    def __init__(self, dims: Mapping[int, int], begin: Layout | None = None) -> None:
         self.dims = dict(dims)
         self.size = sum(self.dims.values())
+        self.begin = begin
         self._indices: dict[tuple[int, ...], NDArray[np.intp]] = {}
 
     @cached_property
     def starts(self) -> dict[int, int]:
         """The first column of each key."""
-        return dict(zip(self.dims, accumulate(self.dims.values(), initial=0), strict=False))
+        begin = self.begin
+        known, size = ({}, 0) if begin is None else (begin.starts, begin.size)
+        keys, dims = (
+            islice(of_all, len(known), None) for of_all in (self.dims, self.dims.values())
+        )
+        return known | dict(zip(keys, accumulate(dims, initial=size), strict=False))
 
     @cached_property
     def columns(self) -> dict[int, slice]:
@@ -58,7 +64,11 @@ class Layout:
 
     def extended(self, dims: Mapping[int, int]) -> Layout:
         """The layout with further keys appended."""
-        return Layout({**self.dims, **dims})
+        return Layout({**self.dims, **dims}, self.begin or self)
+
+    def begins_with(self, other: Layout) -> bool:
+        """Whether the first variables are those of another layout, in the same order."""
+        return list(islice(self.dims, len(other.dims))) == list(other.dims)
 
     def indices(self, keys: Iterable[int]) -> NDArray[np.intp]:
         """Column numbers of the keys, in the order given; not to be changed."""
@@ -69,13 +79,16 @@ class Layout:
         return known
 
     def _columns_of(self, chosen: tuple[int, ...]) -> NDArray[np.intp]:
-        starts = list(map(self.starts.__getitem__, chosen))
-        sizes = list(map(self.dims.__getitem__, chosen))
-        if sizes and sizes.count(sizes[0]) == len(sizes):  # of poses, mostly
-            columns = np.array(starts, np.intp)[:, None] + np.arange(sizes[0])
-            return np.asarray(columns.ravel(), np.intp)
-        ranges = map(range, starts, map(add, starts, sizes))
-        return np.fromiter(chain.from_iterable(ranges), np.intp, sum(sizes))
+        if len(chosen) <= _FEW_KEYS:  # arrays of them take longer
+            columns: list[int] = []
+            for key in chosen:
+                columns += range(start := self.starts[key], start + self.dims[key])
+            return np.array(columns, np.intp)
+        starts = np.array(list(map(self.starts.__getitem__, chosen)), np.intp)
+        sizes = np.array(list(map(self.dims.__getitem__, chosen)), np.intp)
+        ends = sizes.cumsum()
+        shifts = (starts - (ends - sizes)).repeat(sizes)
+        return np.asarray(np.arange(len(shifts)) + shifts, dtype=np.intp)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -114,7 +127,7 @@ class Conditional:
             numpy.linalg.LinAlgError: if some direction is not determined.
         """
         w = self.gone.size
-        return _solved(self.rows[:, :w], self.rows[:, -1] - self.rows[:, w:-1] @ given)
+        return solved(self.rows[:, :w], self.rows[:, -1] - self.rows[:, w:-1] @ given)
 
     def shifted(self, delta: FloatArray) -> Conditional:
         """The same as a function of δ - delta, delta (w + n,) over `gone` and `given`."""
@@ -158,12 +171,25 @@ class SquareRootInformation:
 
     def extended(self, dims: Mapping[int, int]) -> SquareRootInformation:
         """The same Gaussian with further variables of which nothing is known."""
-        if not dims:
+        return self.over(self.layout.extended(dims)) if dims else self
+
+    def over(self, layout: Layout, copy: bool = False) -> SquareRootInformation:
+        """The same Gaussian over a layout that begins with its own: of the rest nothing is known.
+
+        Args:
+            layout: of all variables.
+            copy: whether it is to have memory of its own in any case.
+
+        Raises:
+            ValueError: if the layout has other variables first.
+        """
+        if layout is self.layout and not copy:
             return self
-        layout = self.layout.extended(dims)
+        if layout is not self.layout and not layout.begins_with(self.layout):
+            raise ValueError("the layout has other variables first")
         n, m = self.layout.size, layout.size
-        Rd = np.zeros((m + 1, m + 1), order="F")
-        Rd[:n, :n] = self.R
+        Rd = np.empty((m + 1, m + 1), order="F")  # to fill all of it with zeros takes as long again
+        Rd[:n, :n], Rd[:n, n:m], Rd[n:] = self.R, 0.0, 0.0
         Rd[:n, m] = self.d
         Rd[m, m] = self.Rd[n, n]
         return SquareRootInformation(layout, Rd)
@@ -234,7 +260,7 @@ class SquareRootInformation:
         w = count * b
         if w == 0:
             return self
-        inverse = np.asfortranarray(np.tril(_transposed_inverse(self.R[:w, :w])))  # R₁₁⁻ᵀ
+        inverse = np.asfortranarray(np.tril(transposed_inverse(self.R[:w, :w])))  # R₁₁⁻ᵀ
         covariance = blas.dsyrk(1.0, inverse, trans=1, lower=1)
         blocks = np.arange(w).reshape(count, b)
         covariance[blocks[:, :, None], blocks[:, None, :]] += noise
@@ -256,7 +282,7 @@ class SquareRootInformation:
             numpy.linalg.LinAlgError: if some direction is not determined.
         """
         # with the last row, which LAPACK does not read: `R` alone is no block of memory, so a copy
-        return _solved(self.Rd[:, :-1], self.Rd[:, -1])[:-1]
+        return solved(self.Rd[:, :-1], self.Rd[:, -1])[:-1]
 
     def covariance(self) -> FloatArray:
         """The (n, n) covariance R⁻¹ R⁻ᵀ."""
@@ -284,11 +310,11 @@ class SquareRootInformation:
 
     def root_from(self, first: int) -> FloatArray:
         """A root (m, m) of the covariance of all columns from one on, R⁻ᵀ of these."""
-        return _transposed_inverse(self.R[first:, first:])
+        return transposed_inverse(self.R[first:, first:])
 
     def root_covariance(self) -> FloatArray:
         """The (n, n) upper triangular R⁻¹, a root of the covariance."""
-        return np.asarray(np.tril(_transposed_inverse(self.R)).T, dtype=np.float64)
+        return np.asarray(np.tril(transposed_inverse(self.R)).T, dtype=np.float64)
 
     def marginal(self, keep: Sequence[int]) -> SquareRootInformation:
         """The Gaussian over the variables `keep`, in that order, with all others eliminated."""
@@ -330,49 +356,13 @@ class SquareRootInformation:
         return columns
 
 
-def _solved(R: FloatArray, d: FloatArray) -> FloatArray:
-    """The solution of R x = d for an upper triangular R; rows below its last column are not read.
-
-    As many values follow the solution as there are such rows.
-    """
-    if len(d) == 0:
-        return np.zeros(0)
-    x, info = lapack.dtrtrs(R, d)
-    if info != 0 or not np.isfinite(x).all():
-        raise np.linalg.LinAlgError("the cost does not determine all of its variables")
-    return np.asarray(x, dtype=np.float64)
-
-
-def _transposed_inverse(R: FloatArray) -> FloatArray:
-    """R⁻ᵀ of an upper triangular (n, n) matrix; what is below its diagonal may be anything.
-
-    By the inverses of its halves and triangular products of these, which take half of the time of
-    LAPACK's `dtrtri` for a few hundred columns. What is above the diagonal of the result is zero
-    but for small matrices.
-
-    Raises:
-        numpy.linalg.LinAlgError: if it is singular.
-    """
-    n = len(R)
-    if n <= _SMALL_TRIANGLE:
-        small, info = lapack.dtrtri(R.T, lower=1)
-        if info != 0:
-            raise np.linalg.LinAlgError("the information is singular")
-        return np.asarray(small, dtype=np.float64)
-    half = n // 2
-    inverse = np.zeros((n, n), order="F")
-    inverse[:half, :half] = first = _transposed_inverse(R[:half, :half])
-    inverse[half:, half:] = second = _transposed_inverse(R[half:, half:])
-    corner = blas.dtrmm(-1.0, second, R[:half, half:].T, lower=1)
-    inverse[half:, :half] = blas.dtrmm(1.0, first, corner, side=1, lower=1, overwrite_b=1)
-    return inverse
-
-
 def triangularize(Ab: FloatArray) -> FloatArray:
     """The upper triangular factor of a QR decomposition of (m, n) rows, always (n, n)."""
     n = Ab.shape[1]
-    triangle = np.zeros((n, n), order="F")
     rows = trapezoidal(Ab)
+    if len(rows) == n:
+        return rows
+    triangle = np.zeros((n, n), order="F")
     triangle[: len(rows)] = rows
     return triangle
 
@@ -384,11 +374,4 @@ def trapezoidal(Ab: FloatArray) -> FloatArray:
     qr, _, _, info = lapack.dgeqrf(np.asfortranarray(Ab))
     if info != 0:
         raise ValueError(f"LAPACK's geqrf rejected argument {-info}")
-    m, n = Ab.shape
-    return np.where(upper_triangle(n)[:m], qr[:n], 0.0)
-
-
-@lru_cache(maxsize=64)
-def upper_triangle(n: int) -> BoolArray:
-    """(n, n) where an upper triangle is."""
-    return np.asfortranarray(np.tri(n, dtype=np.bool_).T)
+    return upper_part(qr[: Ab.shape[1]])

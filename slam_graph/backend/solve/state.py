@@ -218,7 +218,18 @@ class State:
             KeyError: if one is not a variable.
         """
         rows = self.points.rows(features)
-        return (self.points.first if first else self.points.estimate)[rows]
+        places = self.points.first.take(rows, axis=0)
+        return places if first else places + self.points.offsets.take(rows, axis=0)
+
+    def both_positions_of(self, features: IntArray) -> tuple[FloatArray, FloatArray]:
+        """Positions (N, 3) of some features, and their first estimates.
+
+        Raises:
+            KeyError: if one is not a variable.
+        """
+        rows = self.points.rows(features)
+        first = self.points.first.take(rows, axis=0)
+        return first + self.points.offsets.take(rows, axis=0), first
 
     def offset(self, layout: Layout) -> FloatArray:
         """Stacked offset (n,) of the estimates from the linearisation points."""
@@ -235,12 +246,17 @@ class State:
 
     def insert_imu_state(self, frame: int, state: NavState) -> None:
         """Add the pose, velocity and bias of a new frame."""
+        tables = self._poses, self._first_poses
         bias = gtsam.imuBias.ConstantBias(state.accel_bias, state.gyro_bias)
         new = gtsam.Values()  # without their names, types are tried in turn: 28 µs for a bias
         new.insert(X(frame), pose3=state.world_T_body)
         new.insert(V(frame), np.asarray(state.velocity, dtype=np.float64))
         new.insert(B(frame), constant_bias=bias)
         self._insert(new, imu_state_keys(frame))
+        self._poses, self._first_poses = (
+            None if table is None else table.with_pose(frame, state.world_T_body)
+            for table in tables
+        )
 
     def insert_calibration(self, values: gtsam.Values) -> None:
         """Add parameters of the rig or of the position fixes."""
@@ -265,7 +281,11 @@ class State:
         """Forget variables."""
         others, features = told_apart(keys)
         self.points = self.points.without(features)
-        self._poses = self._first_poses = None
+        gone = {key & INDEX_MASK for key in others if key >> LETTER_SHIFT == _POSE_CODE}
+        self._poses, self._first_poses = (
+            None if table is None else table.without(gone)
+            for table in (self._poses, self._first_poses)
+        )
         for key in others:
             self.frames.erase(key)
             self.first_frames.erase(key)
@@ -292,6 +312,12 @@ class State:
         others, features = told_apart(keys)
         self._frozen.update(others)
         self.points = self.points.with_frozen(features)
+
+    def freeze_all_of(self, layout: Layout) -> None:
+        """The same of the variables of a layout."""
+        parts = LayoutParts.of(layout)
+        self._frozen.update(parts.keys)
+        self.points = self.points.with_frozen(parts.features)
 
     def rebase(self) -> None:
         """Move all linearisation points to the estimates, the frozen ones too."""
