@@ -13,7 +13,7 @@ from typing import Any, TypeVar, cast
 from slam_graph.interrupts import Interrupts
 from slam_graph.kernels.linked import are_linked, linked_kernel
 
-__all__ = ["collected", "compiled"]
+__all__ = ["SEMANTICS", "collected", "compiled"]
 
 logger = logging.getLogger("slam_graph")
 
@@ -21,7 +21,7 @@ _Kernel = TypeVar("_Kernel", bound=Callable[..., object])
 
 collected: list[tuple[Any, str]] | None = None
 """Kernels and their signatures, where a process makes libraries of them; None elsewhere."""
-_SEMANTICS: dict[str, Any] = {"nogil": True, "error_model": "numpy"}
+SEMANTICS: dict[str, Any] = {"nogil": True, "error_model": "numpy"}
 """Without Python's lock, where kernels are compiled in the process; a division by zero is infinite
 or NaN, as in NumPy."""
 _told = False
@@ -59,7 +59,7 @@ def _collect(
     import numba  # as below
 
     options: dict[str, Any] = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
-    kernel = numba.njit(**options, **_SEMANTICS)(function)
+    kernel = numba.njit(**options, **SEMANTICS)(function)
     if signature:
         kernels.append((kernel, signature))
     return cast("Callable[..., object]", kernel)
@@ -76,7 +76,7 @@ def _compile(function: Callable[..., object], signature: str) -> Callable[..., o
         "no_cpython_wrapper": not signature,
         "no_cfunc_wrapper": True,
     }
-    jit: Any = numba.njit([signature] if signature else None, **options, **_SEMANTICS)
+    jit: Any = numba.njit([signature] if signature else None, **options, **SEMANTICS)
     # a callback of the compiler would lose Ctrl-C
     with Interrupts.completed() as begin, _without_collection():
         begin()
