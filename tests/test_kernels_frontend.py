@@ -18,12 +18,8 @@ from slam_graph.kernels.epipolar import (
     ray_depths_numpy,
 )
 from slam_graph.kernels.halvings import (
-    halve,
-    halve_numpy,
     halved,
     halvings_room,
-    quarter,
-    quarter_numpy,
 )
 from slam_graph.kernels.image_turn import turn_steps, turn_steps_numpy
 from slam_graph.kernels.near_pairs import (
@@ -54,12 +50,10 @@ from slam_graph.kernels.spacing import (
 from slam_graph.kernels.undistortion import (
     approach_radtan,
     invert_radtan,
-    points_radtan,
     undistort_radtan,
 )
 from slam_graph.kernels.window_tracking import WINDOW_PX, track_windows
 from slam_graph.kernels.window_tracking_numpy import track_windows_numpy
-from slam_graph.sensors.lens_models import RadialTangential
 
 EUROC = (-0.28340811, 0.07395907, 0.00019359, 1.76187114e-05)
 
@@ -118,35 +112,6 @@ def test_nearest(points: int, count: int) -> None:
 
 
 @pytest.mark.parametrize(
-    "shape", [(480, 752), (33, 48), (5, 64), (34, 6), (3, 4), (2, 2), (1, 2), (19, 130)]
-)
-def test_halvings_are_those_of_opencv(shape: tuple[int, int]) -> None:
-    rng = np.random.default_rng(11)
-    image = rng.integers(0, 256, shape, dtype=np.uint8)
-    for pixels in (image, np.where(image > 99, np.uint8(255), np.uint8(0))):
-        found, expected = np.zeros((2, (shape[0] + 1) // 2, shape[1] // 2), np.uint8)
-        halve(pixels, found)
-        halve_numpy(pixels, expected)
-        np.testing.assert_array_equal(found, expected)
-        np.testing.assert_array_equal(found, cv2.pyrDown(pixels).reshape(found.shape))
-
-
-@pytest.mark.parametrize("shape", [(480, 752), (4, 4), (8, 132), (120, 36)])
-def test_quarters_are_those_of_opencv(shape: tuple[int, int]) -> None:
-    image = np.random.default_rng(12).integers(0, 256, shape, dtype=np.uint8)
-    found, expected = np.zeros((2, shape[0] // 4, shape[1] // 4), np.uint8)
-    quarter(image, found)
-    quarter_numpy(image, expected)
-    np.testing.assert_array_equal(found, expected)
-    for _ in range(2):
-        size = image.shape[1] // 2, image.shape[0] // 2
-        image = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA)).reshape(
-            size[::-1]
-        )
-    np.testing.assert_array_equal(found, image)
-
-
-@pytest.mark.parametrize(
     ("coefficients", "reach"),
     [(EUROC, 0.9), ((0.0, 0.0, 0.0, 0.0), 1.0), ((-3.0, 0.0, 0.01, -0.02), 0.8)],
 )
@@ -171,17 +136,6 @@ def test_inversion_in_one_call(coefficients: tuple[float, ...]) -> None:
     np.testing.assert_array_equal(found, undistort_radtan(q, start, own, 3, 1e-10))
     assert given_up == np.count_nonzero(np.isnan(start[:, 0]))
     assert (given_up == 0) == (coefficients == EUROC)
-
-
-def test_points_radtan() -> None:
-    m = np.random.default_rng(7).uniform(-1.0, 1.0, (300, 2))
-    expected = RadialTangential.points_numpy(m, EUROC)
-    np.testing.assert_array_equal(points_radtan(m, np.array(EUROC)), expected)
-    others = [m.T.copy().T, np.repeat(m, 2, axis=0)[::2]]
-    read_only = m.copy()
-    read_only.flags.writeable = False
-    for same in (*others, read_only):
-        np.testing.assert_array_equal(RadialTangential().points(same, EUROC), expected)
 
 
 def test_in_mask() -> None:

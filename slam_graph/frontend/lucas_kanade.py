@@ -18,7 +18,7 @@ from slam_graph.frontend.frontend_config import FrontendConfig
 from slam_graph.frontend.keypoints import Image, Pixels, Tracks, contiguous
 from slam_graph.frontend.prediction import Prediction, neighbour_flow
 from slam_graph.frontend.reference_patches import ReferencePatches
-from slam_graph.kernels.halvings import halve, halved, halvings_room
+from slam_graph.kernels.halvings import halved, halvings_room
 from slam_graph.kernels.window_tracking import WINDOW_PX, track_windows
 
 _ITERATIONS = 15
@@ -96,10 +96,7 @@ class _Pyramid:
         larger = halved(self.image, self.halvings, self._made)
         for level in range(self._made + 1, levels + 1):
             smaller = halved(self.image, self.halvings, level)
-            if larger.shape[1] % 2 == 0:
-                halve(larger, smaller)
-            else:  # the same, in twice the time
-                cv2.pyrDown(larger, smaller)
+            cv2.pyrDown(larger, smaller)
             larger = smaller
         self._made = levels
 

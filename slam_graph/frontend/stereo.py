@@ -22,12 +22,11 @@ from slam_graph.arrays import BoolArray, FloatArray
 from slam_graph.frontend.epipolar_test import distances_px
 from slam_graph.frontend.extraction import FeatureExtractor
 from slam_graph.frontend.frontend_config import FrontendConfig
-from slam_graph.frontend.keypoints import Image, Pixels, Tracks, contiguous
+from slam_graph.frontend.keypoints import Image, Pixels, Tracks
 from slam_graph.frontend.lucas_kanade import LucasKanade
 from slam_graph.frontend.outliers import epipolar_distance, essential_matrix
 from slam_graph.kernels.ascending import are_among
 from slam_graph.kernels.epipolar import ray_depths
-from slam_graph.kernels.halvings import quarter
 from slam_graph.kernels.patch_search import along_rays, most_similar
 from slam_graph.sensors import Camera, Rig, RigCamera
 
@@ -187,10 +186,6 @@ class _EpipolarSearch:
 
 def _reduce(image: Image) -> Image:
     """An image of a quarter of the size, each pixel the mean of 4 x 4."""
-    if image.shape[0] % 4 == 0 and image.shape[1] % 4 == 0:
-        reduced = np.empty((image.shape[0] // 4, image.shape[1] // 4), np.uint8)
-        quarter(contiguous(image), reduced)
-        return reduced
     for _ in range(_HALVINGS):
         # Halving twice is several times faster in OpenCV than the same in one step
         size = (image.shape[1] // 2, image.shape[0] // 2)

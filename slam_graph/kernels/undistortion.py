@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""The radial-tangential model and its inverse, for each point by itself."""
+"""The inverse of the radial-tangential model, for each point by itself."""
 
 from __future__ import annotations
 
@@ -14,31 +14,8 @@ from slam_graph.kernels.compilation import compiled
 __all__ = [
     "approach_radtan",
     "invert_radtan",
-    "points_radtan",
     "undistort_radtan",
 ]
-
-
-@compiled("f8[:, ::1](f8[:, ::1], f8[::1])")
-def points_radtan(m: FloatArray, coefficients: FloatArray) -> FloatArray:
-    """Points of the image plane (N, 2) where normalised points are seen.
-
-    The NumPy form, which gives the same bits, is `RadialTangential.points_numpy`.
-
-    Args:
-        m: (N, 2) normalised points.
-        coefficients: (4,) k1, k2, p1, p2.
-    """
-    k1, k2, p1, p2 = coefficients
-    q = np.empty_like(m)
-    for n in range(len(m)):
-        x, y = m[n, 0], m[n, 1]
-        xx, yy, xy = x * x, y * y, x * y
-        r2 = xx + yy
-        radial = 1.0 + r2 * (k1 + k2 * r2)
-        q[n, 0] = x * radial + 2.0 * p1 * xy + p2 * (r2 + 2.0 * xx)
-        q[n, 1] = y * radial + p1 * (r2 + 2.0 * yy) + 2.0 * p2 * xy
-    return q
 
 
 @compiled("f8[:, ::1](f8[:, ::1], f8[::1], i8, f8)")

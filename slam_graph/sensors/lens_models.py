@@ -9,7 +9,6 @@ image plane, the inverse is NaN.
 
 from __future__ import annotations
 
-import sys
 from abc import abstractmethod
 from functools import lru_cache
 from typing import Any, ClassVar
@@ -121,17 +120,6 @@ class RadialTangential(_SolvedInTwoSteps):
 
     def points(self, m: FloatArray, coefficients: Coefficients) -> FloatArray:
         """Points q (N, 2) of normalised points m (N, 2)."""
-        # by a kernel, with the same bits, if kernels are there: to make them may take a minute
-        kernels: Any = sys.modules.get("slam_graph.kernels.undistortion")
-        if not hasattr(kernels, "points_radtan"):
-            return self.points_numpy(m, coefficients)
-        own = np.array(m, np.float64, order="C")  # which a kernel takes, whatever was given
-        points: FloatArray = kernels.points_radtan(own, _row(coefficients))
-        return points
-
-    @staticmethod
-    def points_numpy(m: FloatArray, coefficients: Coefficients) -> FloatArray:
-        """`points` without a kernel."""
         k1, k2, p1, p2 = coefficients
         x, y = m[:, 0], m[:, 1]
         xx, yy, xy = x * x, y * y, x * y
