@@ -336,8 +336,9 @@ def judge_patches(
     for i in range(len(rows)):
         n = rows[i]
         found[i] &= correlations[i] > least_correlation
-        if not found[i]:
-            warps[n] = former[i]
+        if not found[i]:  # one by one: an assignment of all takes six seconds to compile
+            warps[n, 0, 0], warps[n, 0, 1] = former[i, 0, 0], former[i, 0, 1]
+            warps[n, 1, 0], warps[n, 1, 1] = former[i, 1, 0], former[i, 1, 1]
         a, b, c, d = warps[n, 0, 0], warps[n, 0, 1], warps[n, 1, 0], warps[n, 1, 1]
         area = a * d - b * c  # the product of the singular values, of whose squares this is the sum
         squares = a * a + b * b + c * c + d * d
