@@ -50,6 +50,7 @@ class SquareRootEngine:
     ) -> NavState:
         """One turn of the loop: the three modules, in order."""
         context = self._context
+        self._posterior = self._cost = None  # large, and not to be kept beside those of this step
         with report.timed("propagation"):
             corrected = context.by_images(frame, window.points)
             context.propagation.append_frame(window, context.imu, stamp_ns, still_sigma, corrected)

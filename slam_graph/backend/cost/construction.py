@@ -69,6 +69,8 @@ class ConstructedCost:
             again.
         removals: observations that go without being used.
         predicted: what was known of the variables before the images; None if these are left out.
+            The steps change it.
+        remaining: the part of its cost that no values of the variables can remove.
         innovations: distances of the images from that.
         offered: the new features before the gate, without those that will come again.
     """
@@ -83,6 +85,7 @@ class ConstructedCost:
     keep_lost_features: bool
     removals: Removals = field(default_factory=Removals)
     predicted: SquareRootInformation | None = None
+    remaining: float = 0.0
     innovations: Innovations = field(default_factory=Innovations)
     offered: TrackFeatures | None = None
 
@@ -94,7 +97,7 @@ class ConstructedCost:
         """
         if self.predicted is None:
             return Innovations()
-        joint = posterior.residual - self.predicted.residual
+        joint = posterior.residual - self.remaining
         known = replace(self.innovations, passed_distance=joint)
         if known.dof:
             return known
@@ -179,7 +182,8 @@ class CostConstruction:
             seen = seen_by_leaving(window.tracks, window.past, poses)
             constructed.loses_pose = is_in(cost.tracks.obs.ids, seen)
             constructed.absorbed = self._absorbed(cost.tracks, constructed.loses_pose)
-        constructed.linear, constructed.predicted = linear, predicted
+        constructed.linear = linear
+        constructed.predicted, constructed.remaining = predicted, predicted.residual
         if offered is not None:  # those that go on waiting come again
             waiting = cost.ids_of(~constructed.absorbed)
             constructed.offered = offered.subset(~is_in(offered.obs.ids, waiting))

@@ -74,7 +74,8 @@ def minimize(
         policy: kind and number of steps.
         linear: the linearisation at the current estimates, where it is known already.
         again: asks for more steps than the policy has, up to `_MAX_REPEATED_STEPS` in all.
-        predicted: what is known without images at the current estimates, where that is known.
+        predicted: what is known without images at the current estimates, where that is known. It
+            is changed: copies of large matrices take time and memory.
         hopeful: is asked after each step of Levenberg-Marquardt; where it says no, the steps end
             without having converged.
 
@@ -126,8 +127,7 @@ def _step(
     delta = posterior.solution()
     cost.apply(delta, linear, layout)
     promised = _promised(posterior)
-    moved = posterior.shifted(delta, overwrite=posterior is not predicted)
-    return moved, delta, promised
+    return posterior.shifted(delta, overwrite=True), delta, promised
 
 
 def linearized(cost: Cost, linear: Linearization | None = None) -> SquareRootInformation:
@@ -153,7 +153,7 @@ def _system(
     else:
         system = predicted.over(layout)
     for rows in cost.rows(linear, layout):
-        system = system.updated(rows, overwrite=system is not predicted, overwrite_rows=True)
+        system = system.updated(rows, overwrite=True, overwrite_rows=True)
     return system
 
 
