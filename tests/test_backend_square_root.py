@@ -183,6 +183,16 @@ def test_an_extension_adds_variables_of_which_nothing_is_known() -> None:
     assert gauss.extended({}) is gauss
     with pytest.raises(ValueError, match="other variables first"):
         gauss.over(Layout({20: 2, **DIMS}))
+    with pytest.raises(ValueError, match="appended twice"):
+        gauss.layout.extended({next(iter(DIMS)): 6, 20: 2})
+
+
+def test_a_copy_has_its_own_memory() -> None:
+    gauss = gaussian(np.random.default_rng(6))
+    before = gauss.Rd.copy()
+    for layout in (gauss.layout, gauss.layout.extended({20: 2})):
+        gauss.over(layout, copy=True).Rd[:] = 7.0
+    np.testing.assert_array_equal(gauss.Rd, before)
 
 
 @pytest.mark.parametrize("shape", [(3, 7), (7, 7), (0, 4)])

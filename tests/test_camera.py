@@ -76,6 +76,24 @@ def test_undistort_inverts_distort(camera: Camera) -> None:
     np.testing.assert_allclose(camera.undistort(camera.distort(m)[0]), m, atol=1e-8)
 
 
+def test_coefficients_may_be_a_list_and_points_of_a_model_in_any_order(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    given = Camera(458.0, 457.0, 367.0, 248.0, "radtan", [-0.28, 0.07, 1e-4, 1e-5], 752, 480)  # type: ignore[arg-type]
+    same = replace(given, coefficients=(-0.28, 0.07, 1e-4, 1e-5))
+    pixels = pixel_grid(given)
+    np.testing.assert_array_equal(given.undistort(pixels), same.undistort(pixels))
+    assert given == same
+    plain, pixels = FieldOfView.undistort, pixel_grid(FOV)
+    expected = FOV.undistort(pixels)
+    monkeypatch.setattr(
+        FieldOfView, "undistort", lambda *given: np.asfortranarray(plain(*given))
+    )  # as `np.stack([x, y]).T` is
+    found = FOV.undistort(pixels)
+    assert found.flags.c_contiguous
+    np.testing.assert_array_equal(found, expected)
+
+
 @each_camera
 def test_jacobian_matches_numerical_derivative(camera: Camera) -> None:
     m = np.concatenate([camera.undistort(pixel_grid(camera)), np.zeros((1, 2)), [[1e-7, -1e-7]]])

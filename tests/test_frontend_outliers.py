@@ -18,8 +18,8 @@ from slam_graph.frontend.outliers import (
     essential_matrix,
     fundamental_inliers,
     map_inliers,
-    triangulated_depths,
 )
+from slam_graph.kernels.epipolar import ray_depths
 
 FOCAL_PX = 450.0
 Method = Literal["fundamental", "essential", "magsac", "gyroscope"]
@@ -37,10 +37,18 @@ def scene(
     return in_a[:, :2] / in_a[:, 2:], in_b[:, :2] / in_b[:, 2:], depths_m
 
 
+def depths_of(
+    b_T_a: gtsam.Pose3, m_a: NDArray[np.float64], m_b: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Depths (N, 2) of matches in a and b."""
+    R = np.ascontiguousarray(b_T_a.rotation().matrix())
+    return ray_depths(R, np.array(b_T_a.translation()), m_a, m_b)
+
+
 def test_true_matches_fit_the_essential_matrix_and_triangulate() -> None:
     m_a, m_b, depths_m = scene(np.random.default_rng(0), 50)
     assert np.max(epipolar_distance(essential_matrix(B_T_A), m_a, m_b)) < 1e-12
-    np.testing.assert_allclose(triangulated_depths(B_T_A, m_a, m_b), depths_m, rtol=1e-9)
+    np.testing.assert_allclose(depths_of(B_T_A, m_a, m_b), depths_m, rtol=1e-9)
 
 
 def test_epipolar_distance_is_the_smallest_correction() -> None:
@@ -57,8 +65,8 @@ def test_epipolar_distance_is_the_smallest_correction() -> None:
 def test_parallel_rays_are_infinitely_far_away() -> None:
     sideways = gtsam.Pose3(gtsam.Rot3(), [-0.1, 0, 0])
     m = np.array([[0.1, 0.2]])
-    assert np.all(np.isinf(triangulated_depths(sideways, m, m)))
-    behind = triangulated_depths(sideways, m, m + np.array([0.01, 0.0]))
+    assert np.all(np.isinf(depths_of(sideways, m, m)))
+    behind = depths_of(sideways, m, m + np.array([0.01, 0.0]))
     assert np.all(behind < 0)
 
 

@@ -17,10 +17,7 @@ from slam_graph.kernels.epipolar import (
     ray_depths,
     ray_depths_numpy,
 )
-from slam_graph.kernels.halvings import (
-    halved,
-    halvings_room,
-)
+from slam_graph.kernels.halvings import halved, halvings_room
 from slam_graph.kernels.image_turn import turn_steps, turn_steps_numpy
 from slam_graph.kernels.near_pairs import (
     median_motions,
@@ -47,11 +44,7 @@ from slam_graph.kernels.spacing import (
     in_mask,
     in_mask_numpy,
 )
-from slam_graph.kernels.undistortion import (
-    approach_radtan,
-    invert_radtan,
-    undistort_radtan,
-)
+from slam_graph.kernels.undistortion import approach_radtan, invert_radtan, undistort_radtan
 from slam_graph.kernels.window_tracking import WINDOW_PX, track_windows
 from slam_graph.kernels.window_tracking_numpy import track_windows_numpy
 

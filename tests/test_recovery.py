@@ -188,7 +188,7 @@ def test_corrections_of_the_velocity_count_where_tracks_are_broken(
     corrections, step_ns = Corrections(), 50_000_000
     with pytest.raises(DivergenceError) if noticed else nullcontext():
         for k in range(80):
-            ids = np.arange(30) + (first_id if k >= 40 else 0)
+            ids = np.arange(30, dtype=(np.int32, np.int64)[k % 2]) + (first_id if k >= 40 else 0)
             seen = FeatureObservations(ids, np.zeros((30, 2)), np.zeros((30, 2)))
             corrections.note(FeatureFrame(k * step_ns, (seen,)))
             if not 20 < k < 35:

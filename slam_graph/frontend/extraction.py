@@ -137,7 +137,7 @@ class FeatureExtractor:
 
     def allows(self, points: Pixels) -> BoolArray:
         """Which points (N, 2) the mask allows; none outside of the image."""
-        return in_mask(self._allowed, np.ascontiguousarray(points))
+        return in_mask(self._allowed, np.ascontiguousarray(points, np.float32))
 
     def count_apart(self, points: Pixels) -> None:
         """Do not count some of the features (N, 2): they move, and say nothing of the platform.

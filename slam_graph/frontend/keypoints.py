@@ -174,7 +174,7 @@ class Tracks:
         )
 
     def joined(self, other: Tracks) -> Tracks:
-        """These features and others, in the order of their ids."""
+        """These features and others, in the order of their ids; both must be in that order."""
         if len(other) == 0:
             return self
         ids = np.concatenate([self.ids, other.ids])

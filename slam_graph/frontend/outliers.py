@@ -12,7 +12,7 @@ import numpy as np
 
 from slam_graph.arrays import BoolArray, FloatArray, IntArray
 from slam_graph.frontend.frontend_config import FrontendConfig
-from slam_graph.kernels.epipolar import constraint_moments, ray_depths, sampson_distances
+from slam_graph.kernels.epipolar import constraint_moments, sampson_distances
 
 MIN_POINTS = 8
 """With fewer matches the fundamental matrix fits anything; nothing is rejected then."""
@@ -280,15 +280,6 @@ def epipolar_distance(E: FloatArray, m_a: FloatArray, m_b: FloatArray) -> FloatA
     the match fit (Hartley and Zisserman 2004, eq. 11.9).
     """
     return sampson_distances(_contiguous(E), _contiguous(m_a), _contiguous(m_b))
-
-
-def triangulated_depths(b_T_a: gtsam.Pose3, m_a: FloatArray, m_b: FloatArray) -> FloatArray:
-    """Depths (N, 2) in a and in b of the closest points of the two rays, in metres.
-
-    They are infinite where the rays are parallel, and negative where they meet behind a camera.
-    """
-    R, t = b_T_a.rotation().matrix(), np.array(b_T_a.translation())  # not read-only
-    return ray_depths(_contiguous(R), t, _contiguous(m_a), _contiguous(m_b))
 
 
 def _contiguous(values: FloatArray) -> FloatArray:

@@ -133,7 +133,9 @@ class _EpipolarSearch:
     def __init__(self, camera: Camera, other_T_reference: gtsam.Pose3, min_depth_m: float) -> None:
         self._camera = camera
         # arrays as kernels take them: in rows, and not read-only
-        self.R: FloatArray = np.array(other_T_reference.rotation().matrix(), order="C")
+        rotation = other_T_reference.rotation().matrix()
+        self.R: FloatArray = np.ascontiguousarray(rotation)
+        self._turn: FloatArray = np.ascontiguousarray(rotation.T)  # for rows on its left
         self.t: FloatArray = np.array(other_T_reference.translation())
         disparity_px = camera.fx * float(np.linalg.norm(self.t)) / min_depth_m
         count = int(disparity_px / (_SEARCH_STEP_PX * 2**_HALVINGS)) + 2
@@ -155,11 +157,11 @@ class _EpipolarSearch:
         if self._camera.model.sees_sideways:
             rays /= np.linalg.norm(rays, axis=1, keepdims=True)
         shifts = np.outer(inverse_depth_per_m, self.t)
-        m = along_rays(rays @ self.R.T, shifts, _NEAREST)
+        m = along_rays(rays @ self._turn, shifts, _NEAREST)
         pixels = self._camera.pixels(m)
         if self._camera.model.sees_sideways:  # beyond its reach a point may come out in the image
             pixels[~self._camera.within_reach(m, MAX_TANGENT)] = _FAR_OFF_PX
-        return np.ascontiguousarray(pixels.reshape(len(rays), -1, 2))
+        return np.ascontiguousarray(pixels.reshape(len(rays), len(shifts), 2))
 
     def search(
         self, reference: Image, other: Image, pixels: Pixels, normalized: FloatArray

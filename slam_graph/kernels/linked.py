@@ -113,8 +113,9 @@ def _checked(
 
     scope: dict[str, Any] = {kind: np.dtype(kind) for kind, axes in types if axes}
     scope |= {"ndarray": np.ndarray, "numbers": _NUMBERS, "kernel": kernel, "refuse": refuse}
-    checked = eval(f"lambda *given: kernel(*given) if {fits} else refuse(*given)", scope)
-    return wraps(function)(checked)
+    checked = f"def checked(*given):\n    return kernel(*given) if {fits} else refuse(*given)"
+    exec(compile(checked, __file__, "exec"), scope)
+    return wraps(function)(scope["checked"])
 
 
 def _test(given: str, kind: str, axes: str) -> str:

@@ -317,13 +317,13 @@ def judge_patches(
     """Which templates to give up, after they were looked for by `align_patches`.
 
     Args:
-        found: (N,) from there; made false where the two are not alike, or the view has changed.
+        found: (N,) from there; made false where template and image differ, or the view has changed.
         correlations: (N,) from there.
         rows: (N,) which of the templates these are.
         former: (N, 2, 2) their warps before.
-        warps: (T, 2, 2) the warps now; where the two are not alike that is undone.
-        refusals: (T,) how many times in a row each was not found; counted on, or set to 0.
-        least_correlation: what is less alike is not taken for the same patch.
+        warps: (T, 2, 2) the warps now; the former ones again where template and image differ.
+        refusals: (T,) in how many images in a row each was not found; renewed.
+        least_correlation: with less, template and image differ.
         smallest: change of the area below which the view has changed too much.
         largest: the same above which it has.
         most_stretched: and the ratio of the singular values of the warp above which it has.

@@ -11,11 +11,7 @@ import numpy as np
 from slam_graph.arrays import FloatArray
 from slam_graph.kernels.compilation import compiled
 
-__all__ = [
-    "approach_radtan",
-    "invert_radtan",
-    "undistort_radtan",
-]
+__all__ = ["approach_radtan", "invert_radtan", "undistort_radtan"]
 
 
 @compiled("f8[:, ::1](f8[:, ::1], f8[::1], i8, f8)")
@@ -114,6 +110,8 @@ def invert_radtan(
     tolerance: float,
 ) -> tuple[FloatArray, int]:
     """`approach_radtan`, then `undistort_radtan` from there, in one call.
+
+    In NumPy it is these two, one after the other.
 
     Returns:
         (N, 2) normalised points; and how many of them are NaN because the first one gave up.

@@ -53,6 +53,7 @@ class Camera:
     height: int
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "coefficients", tuple(self.coefficients))  # a list may be given
         count = len(self.model.coefficient_names)
         if len(self.coefficients) != count:
             raise DataError(
@@ -145,7 +146,8 @@ class Camera:
             return np.zeros((0, 2))
         q = pixels - self._center
         q /= self._focal
-        return self.model.undistort(q, self.coefficients, near)
+        points = self.model.undistort(q, self.coefficients, near)
+        return np.ascontiguousarray(points, np.float64)  # as kernels want it, whatever the model
 
     def within_reach(self, normalized: FloatArray, max_coordinate: float) -> BoolArray:
         """Which normalised points (N, 2) are so near to the axis that the model holds.

@@ -248,9 +248,10 @@ class Cost:
         )
 
     def _whitened(self, obs: Observations, points: FloatArray | None) -> WhitenedObservations:
-        rig, now, then = self.rig.at(self.state), points, points
-        if now is None or then is None:
-            now, then = self.state.both_positions_of(obs.ids)
+        rig = self.rig.at(self.state)
+        now, then = (
+            (points, points) if points is not None else self.state.both_positions_of(obs.ids)
+        )
         first = self._geometry(rig, obs, then, first=True)
         estimate = self._geometry(rig, obs, now)
         return whiten(obs, rig, first, estimate, self.sigmas(obs), self.robust)

@@ -141,9 +141,8 @@ class StandstillDetector:
         sigma = self._noise_of_last_frames() if len(self._recent) > 2 else None
         if sigma is not None:
             self._noises_px.append((self._recent[-1][0], sigma))
-        noises_px, count = sorted(px for _, px in self._noises_px), len(self._noises_px)
-        middle_px = noises_px[(count - 1) // 2 : count // 2 + 1]
-        self.noise_px = sum(middle_px) / len(middle_px) if middle_px else 0.0
+        noises_px = [px for _, px in self._noises_px]
+        self.noise_px = float(np.median(noises_px)) if noises_px else 0.0
 
     def _noise_of_last_frames(self) -> float | None:
         """The noise by the second differences of the last three frames, with enough features.

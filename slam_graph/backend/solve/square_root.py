@@ -63,12 +63,18 @@ class Layout:
         return key in self.dims
 
     def extended(self, dims: Mapping[int, int]) -> Layout:
-        """The layout with further keys appended."""
+        """The layout with further keys appended.
+
+        Raises:
+            ValueError: if it has one of them.
+        """
+        if not self.dims.keys().isdisjoint(dims):
+            raise ValueError("a variable cannot be appended twice")
         return Layout({**self.dims, **dims}, self.begin or self)
 
     def begins_with(self, other: Layout) -> bool:
         """Whether the first variables are those of another layout, in the same order."""
-        return list(islice(self.dims, len(other.dims))) == list(other.dims)
+        return list(islice(self.dims.items(), len(other.dims))) == list(other.dims.items())
 
     def indices(self, keys: Iterable[int]) -> NDArray[np.intp]:
         """Column numbers of the keys, in the order given; not to be changed."""

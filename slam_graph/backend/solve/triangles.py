@@ -11,6 +11,8 @@ from scipy.linalg import blas, lapack
 
 from slam_graph.arrays import FloatArray, IntArray
 
+_ROUNDED = 128
+"""Masks are made for multiples of this, as they take as much memory as the matrices."""
 _SMALL_TRIANGLE = 64
 """Triangles up to this size are inverted at once."""
 
@@ -60,10 +62,11 @@ def upper_part(values: FloatArray) -> FloatArray:
     By their bits, whatever values are below: `np.where` and `np.triu` take three times as long.
     """
     m, n = values.shape
-    return (values.view(np.int64) & _upper_bits(n)[:m]).view(np.float64)
+    mask = _upper_bits(-(-n // _ROUNDED) * _ROUNDED)[:m, :n]
+    return (values.view(np.int64) & mask).view(np.float64)
 
 
-@lru_cache(maxsize=64)
+@lru_cache(maxsize=8)
 def _upper_bits(n: int) -> IntArray:
     """(n, n) all bits where an upper triangle is."""
     return np.asfortranarray(-np.tri(n, dtype=np.int64).T)
