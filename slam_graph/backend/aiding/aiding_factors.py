@@ -139,6 +139,7 @@ class Aiding:
         if not self.aligned:
             return factors
         unknown = self._follow(state, prior)
+        judged: list[tuple[Fix, Fix, SeenFixes | None, float]] = []
         for fix in self._due(stamps_ns):
             share = (fix.stamp_ns - stamps_ns[0]) / (stamps_ns[1] - stamps_ns[0])
             then = (
@@ -153,9 +154,13 @@ class Aiding:
             else:
                 here = self._of_unsure_time(here, (first, last), stamps_ns)
             weight = 1.0 if known is None else self.gates[fix.source].weight(here, last, known)
-            if weight == 0.0:
+            judged.append((fix, here, seen, weight))
+        wrong = {fix.stamp_ns for fix, *_, weight in judged if fix.is_of_pose and weight == 0.0}
+        key = pose_key(frames[1])
+        for fix, here, seen, weight in judged:
+            # a tag that is taken for another one is wrong in position and orientation
+            if weight == 0.0 or (fix.is_of_pose and fix.stamp_ns in wrong):
                 continue
-            key = pose_key(frames[1])
             if seen is None or self.variables is None:
                 factors.append(here.factor(key, weight))
             else:

@@ -57,6 +57,11 @@ class PositionFix:
         """Whether the time offset of its source may be estimated."""
         return self.source == "gnss"
 
+    @property
+    def is_of_pose(self) -> bool:
+        """Whether it is part of a known pose, whose orientation may be measured as well."""
+        return self.source == "poses"
+
     def moved(self, then: gtsam.Pose3, now: gtsam.Pose3) -> PositionFix:
         """The same measurement at another pose of the body.
 
@@ -102,6 +107,7 @@ class OrientationFix:
     covariance: FloatArray
     source: str = "orientations"
     is_timed: ClassVar[bool] = False
+    is_of_pose: ClassVar[bool] = True
 
     def moved(self, then: gtsam.Pose3, now: gtsam.Pose3) -> OrientationFix:
         """See `PositionFix`."""
