@@ -11,10 +11,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from slam_graph.arrays import IntArray
-from slam_graph.backend.cost.feature_tracks import is_in
 from slam_graph.config import RunConfig
 from slam_graph.errors import EstimationError
 from slam_graph.geometry import NavState
+from slam_graph.kernels.ascending import are_among
 from slam_graph.sensors import FeatureFrame
 
 _KNOWN_VELOCITY, _LESS_KNOWN = 0.5, 3.0
@@ -207,10 +207,10 @@ class Corrections:
 
     def note(self, frame: FeatureFrame) -> None:
         """Note whether the tracks of the frame before go on in this one."""
-        ids = frame.ids
+        ids = np.array(frame.ids, np.int64)  # as a kernel takes them, whatever a front end gives
         if not len(ids):
             return
-        again = np.count_nonzero(is_in(self._ids, ids))
+        again = np.count_nonzero(are_among(self._ids, ids))
         if again < _FOUND_AGAIN * len(self._ids):
             self._broken_ns = frame.stamp_ns
         self._ids = ids
