@@ -147,6 +147,7 @@ def test_judge_patches() -> None:
     former = np.eye(2) + rng.normal(0.0, 0.1, (80, 2, 2))
     warps = np.eye(2) + rng.normal(0.0, 0.3, (90, 2, 2))
     found, correlations = rng.random(80) < 0.8, rng.uniform(0.5, 1.0, 80)
+    found[0], correlations[0] = True, np.nan  # of a patch without contrast
     results = []
     for judge in (judge_patches, judge_patches_numpy):
         own, after, refusals = found.copy(), warps.copy(), np.arange(90) % 4

@@ -217,7 +217,7 @@ def error_m(sequence: SimulatedSequence, result: RunResult) -> float:
 
 @pytest.mark.parametrize(
     ("algorithm", "imu"),
-    [("msckf", True), slow("ekf", False), slow("okvis", True), slow("fixed_lag_isam2", False)],
+    [("msckf", True), ("ekf", False), slow("okvis", True), slow("fixed_lag_isam2", False)],
 )
 def test_a_flight_ends_in_the_world_of_the_poses(algorithm: str, imu: bool) -> None:
     sequence = flight(0, imu)

@@ -156,6 +156,25 @@ def test_threads_that_need_a_part_at_once_all_get_it(
     assert len(set(parts)) == 1
 
 
+def test_an_import_that_failed_is_tried_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    home = tmp_path / "failing_shapes.py"
+    home.write_text("raise OSError('too many open files')\n")
+    registry: Registry[Shape] = Registry(GROUP, "shape", "failing_shapes", ("disc",))
+    module = ModuleType("registry_of_failing_shapes")
+    monkeypatch.setattr(module, "REGISTRY", registry, raising=False)
+    monkeypatch.setitem(sys.modules, module.__name__, module)
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(OSError, match="too many open files"):
+        registry["disc"]
+    home.write_text(
+        "from registry_of_failing_shapes import REGISTRY\n"
+        "@REGISTRY.register('disc')\ndef disc(side): return side\n"
+    )
+    assert registry["disc"](2.0) == 2.0
+
+
 # --- a package that is installed ------------------------------------------------------------------
 
 EXAMPLE = Path(__file__).parent / "plugin_example"
