@@ -198,7 +198,7 @@ def _contradicted(made: PoseGraph, graph: PoseGraph, optimum: Poses) -> NDArray[
     That is by its innovation: b whitened residuals, A their Jacobian and Σ the covariance of the
     two poses, χ² = bᵀ (I + A Σ Aᵀ)⁻¹ b.
     """
-    values, factors = values_of(optimum), edge_factors(made, range(len(made.edges)))
+    values, factors = values_of(optimum), edge_factors(made)
     squared = edge_chi2(factors, values)
     clean = [*factors[: len(graph.edges)], *anchor_factors(graph)]
     marginals = gtsam.Marginals(factor_graph(clean), values)

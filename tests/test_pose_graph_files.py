@@ -53,7 +53,7 @@ def test_g2o_files_mean_what_they_mean_to_gtsam(
     theirs, values = gtsam.readG2o(str(gtsam_data / name), in_space)
     graph = read_pose_graph(gtsam_data / name)
     assert graph.estimates is not None
-    ours = factor_graph(edge_factors(graph, range(len(graph.edges))))
+    ours = factor_graph(edge_factors(graph))
     # Angles of measurements have six digits, and quaternions are not of unit length to the last.
     assert ours.error(values_of(graph.estimates)) == pytest.approx(theirs.error(values), rel=1e-6)
 

@@ -191,7 +191,7 @@ def graduated_nonconvexity(
     uncertain = uncertain_edges(graph, policy)
     weights, least = np.ones(len(graph.edges)), np.zeros(len(graph.edges))
     least[tree_edges(graph)] = _MIN_TREE_WEIGHT
-    plain, anchors = edge_factors(graph, range(len(graph.edges))), anchor_factors(graph)
+    plain, anchors = edge_factors(graph), anchor_factors(graph)
     values, control = _start(graph, policy, anchors, diagnostics)
     for _ in range(_MAX_UPDATES):
         squared = edge_chi2(plain, values)[uncertain]
@@ -257,7 +257,7 @@ def _step(
     """One Gauss-Newton step on the edges of positive weight; damped if the problem is singular."""
     rows = np.flatnonzero(weights > 0)
     weighted = graph.keep_edges(rows).weighted(weights[rows])
-    factors = factor_graph([*edge_factors(weighted, range(len(rows))), *anchors])
+    factors = factor_graph([*edge_factors(weighted), *anchors])
     try:
         return _one_step(gtsam.GaussNewtonOptimizer, gtsam.GaussNewtonParams(), factors, values)
     except RuntimeError:  # too poorly conditioned without damping

@@ -67,11 +67,11 @@ def construct(graph: PoseGraph, policy: PoseGraphCostPolicy, weights: FloatArray
     """
     rows = np.flatnonzero(weights > 0)
     scaled = graph.keep_edges(rows).weighted(weights[rows])
-    factors = edge_factors(scaled, range(len(rows)))
+    factors = edge_factors(scaled)
     if policy.robust not in ("none", "gnc"):
         uncertain = uncertain_edges(scaled, policy)
         width = _robust_width(graph, policy)
-        robust = edge_factors(scaled, uncertain.tolist(), policy.robust, width)
+        robust = edge_factors(scaled.keep_edges(uncertain), policy.robust, width)
         for row, factor in zip(uncertain.tolist(), robust, strict=True):
             factors[row] = factor
     return PoseGraphCost(graph, policy, rows, factors, anchor_factors(graph))
@@ -103,7 +103,7 @@ def loss_weights(cost: PoseGraphCost, poses: Poses) -> FloatArray:
         return weights
     estimator = robust_estimator(policy.robust, _robust_width(cost.graph, policy))
     uncertain = cost.rows[uncertain_edges(cost.graph.keep_edges(cost.rows), policy)]
-    plain = edge_factors(cost.graph, uncertain.tolist())
+    plain = edge_factors(cost.graph.keep_edges(uncertain))
     lengths = np.sqrt(edge_chi2(plain, values_of(poses)))
     at = np.searchsorted(cost.rows, uncertain)
     weights[at] = [estimator.weight(length) for length in lengths.tolist()]

@@ -166,18 +166,19 @@ def _by_kind(path: Path, diagnostics: Diagnostics) -> dict[str, Rows]:
         raise DataError(f"{path}: cannot be read ({error.strerror})") from None
     kinds: dict[str, Rows] = {}
     for number, line in enumerate(lines, 1):
-        tag = line.split(None, 1)[0] if line and not line.isspace() else "#"
-        if tag in _LINES:
-            rows = kinds.get(tag)
-            if rows is None:
-                rows = kinds[tag] = Rows(path, [], [])
-            rows.lines.append(line)
-            rows.numbers.append(number)
-        elif not tag.startswith("#"):
-            diagnostics.warn(
-                "pose_graph_line_ignored",
-                f"{path}:{number}: '{tag[:40]}' is not a known kind of line; left out",
-            )
+        rows = kinds.get(line.partition(" ")[0])  # of most lines; the first of a kind goes on
+        if rows is None:
+            tag = line.split(None, 1)[0] if line and not line.isspace() else "#"
+            if tag not in _LINES:
+                if not tag.startswith("#"):
+                    diagnostics.warn(
+                        "pose_graph_line_ignored",
+                        f"{path}:{number}: '{tag[:40]}' is not a known kind of line; left out",
+                    )
+                continue
+            rows = kinds.setdefault(tag, Rows(path, [], []))
+        rows.lines.append(line)
+        rows.numbers.append(number)
     return kinds
 
 

@@ -26,9 +26,9 @@ ROTATION_FIRST = np.array([3, 4, 5, 0, 1, 2])
 
 
 def edge_factors(
-    graph: PoseGraph, rows: Iterable[int], loss: str = "none", width: float = 1.0
+    graph: PoseGraph, loss: str = "none", width: float = 1.0
 ) -> list[gtsam.NonlinearFactor]:
-    """Between factors of some edges, with a robust loss on the whitened residual.
+    """Between factors of all edges, with a robust loss on the whitened residual.
 
     The width of `dcs` is the Φ of Agarwal et al. 2013, which is compared with the squared residual.
     """
@@ -38,19 +38,14 @@ def edge_factors(
         information = information[:, ROTATION_FIRST[:, None], ROTATION_FIRST]
     estimator = None if loss == "none" else robust_estimator(loss, width)
     gaussian, robust = gtsam.noiseModel.Gaussian.Information, gtsam.noiseModel.Robust.Create
-    poses, ends = gtsam_poses(graph.measured), graph.edges.tolist()
-    like_last = _repeated(information).tolist()
-    factors: list[gtsam.NonlinearFactor] = []
-    noise: Any = None
-    last = -1
-    for row in rows:
-        if noise is None or row != last + 1 or not like_last[row]:
-            noise = gaussian(information[row], False)
-            if estimator is not None:
-                noise = robust(estimator, noise)
-        last = row
-        factors.append(between(*ends[row], poses[row], noise))
-    return factors
+    noises: list[Any] = []
+    for matrix, like_last in zip(information, _repeated(information).tolist(), strict=True):
+        if like_last:
+            noises.append(noises[-1])
+            continue
+        noise = gaussian(matrix, False)
+        noises.append(noise if estimator is None else robust(estimator, noise))
+    return list(map(between, *graph.edges.T.tolist(), gtsam_poses(graph.measured), noises))
 
 
 def _repeated(information: FloatArray) -> BoolArray:
@@ -102,7 +97,7 @@ def factor_graph(factors: Iterable[gtsam.NonlinearFactor]) -> gtsam.NonlinearFac
     """Factors as a graph."""
     graph = gtsam.NonlinearFactorGraph()
     for factor in factors:
-        graph.push_back(factor)
+        graph.add(factor)  # a third of the time of `push_back`, which tries more types
     return graph
 
 

@@ -159,7 +159,7 @@ class PoseGraphSolution(Displayed):
             EstimationError: if a pose is not determined.
         """
         weighted = self.weighted_graph()
-        factors = edge_factors(weighted, range(len(weighted.edges)))
+        factors = edge_factors(weighted)
         held = factor_graph([*factors, *anchor_factors(weighted, True, relative_to)])
         rows = range(len(self.poses)) if rows is None else rows
         try:
