@@ -177,6 +177,8 @@ class BalLinearization:
         by_camera: (N, 2, 9) derivatives of the pixels by δθ, δt, f, k1, k2.
         by_point: (N, 2, 3) derivatives by the point.
         r: (N, 2) residuals: predicted minus measured pixels.
+
+    In memory the same number of all observations lies together, as it is computed for all at once.
     """
 
     by_camera: FloatArray
@@ -198,13 +200,14 @@ def project(
         pixels: (N, 2); not finite for a point with zero depth.
         depths: (N,) along the optical axis; negative behind the camera.
     """
-    P = _rotated(estimates, camera, point) + estimates.translations[camera].T
-    f, k1, k2 = estimates.intrinsics[camera].T
+    R, X = _columns(estimates.rotations, camera), _columns(estimates.points, point)
+    P = _rotated(R, X) + _columns(estimates.translations, camera)
+    f, k1, k2 = _columns(estimates.intrinsics, camera)
     with np.errstate(all="ignore"):
         u, v = -P[:2] / P[2]
         q = u * u + v * v
         scale = f * (1.0 + q * (k1 + q * k2))
-        return np.stack([scale * u, scale * v], axis=1), -P[2]
+        return np.stack([scale * u, scale * v]).T, -P[2]
 
 
 def linearize(
@@ -220,36 +223,42 @@ def linearize(
 
     and P = R X + t on δθ by -[R X]ₓ.
     """
-    N, y = len(camera), _rotated(estimates, camera, point)
-    P = y + estimates.translations[camera].T
-    f, k1, k2 = estimates.intrinsics[camera].T
+    R, X = _columns(estimates.rotations, camera), _columns(estimates.points, point)
+    y = _rotated(R, X)
+    P = y + _columns(estimates.translations, camera)
+    f, k1, k2 = _columns(estimates.intrinsics, camera)
     inverse = -1.0 / P[2]
     uv = P[:2] * inverse
     q = uv[0] ** 2 + uv[1] ** 2
     d, twice_slope = 1.0 + q * (k1 + q * k2), 2.0 * (k1 + 2.0 * q * k2)
-    along = f * inverse * twice_slope
-    R = estimates.rotations[camera].transpose(1, 2, 0)
-    by_camera, by_point = np.empty((N, 2, CAMERA_DIM)), np.empty((N, 2, 3))
-    for row in range(2):
-        g = np.empty((3, N))
+    along, plain = f * inverse * twice_slope, f * inverse * d
+    by_f = np.stack([d, f * q, f * q * q])
+    by_camera, by_point = np.empty((2, CAMERA_DIM, len(f))), np.empty((2, 3, len(f)))
+    for row, (of_camera, of_point) in enumerate(zip(by_camera, by_point, strict=True)):
+        g = of_camera[3:6]
         g[:2] = along * uv[row] * uv
-        g[row] += f * inverse * d
+        g[row] += plain
         g[2] = g[0] * uv[0] + g[1] * uv[1]
         for a, b, c in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
-            by_camera[:, row, a] = y[b] * g[c] - y[c] * g[b]
-            by_camera[:, row, 3 + a] = g[a]
-            by_point[:, row, a] = g[0] * R[0, a] + g[1] * R[1, a] + g[2] * R[2, a]
-        by_camera[:, row, 6] = d * uv[row]
-        by_camera[:, row, 7] = f * q * uv[row]
-        by_camera[:, row, 8] = f * q * q * uv[row]
-    return BalLinearization(by_camera, by_point, (f * d * uv).T - pixels)
+            of_camera[a] = y[b] * g[c] - y[c] * g[b]
+        of_camera[6:] = by_f * uv[row]
+        of_point[:] = g[0] * R[:3] + g[1] * R[3:6] + g[2] * R[6:]
+    r = f * d * uv - pixels.T
+    return BalLinearization(by_camera.transpose(2, 0, 1), by_point.transpose(2, 0, 1), r.T)
 
 
-def _rotated(estimates: BalEstimates, camera: IntArray, point: IntArray) -> FloatArray:
-    """(3, N) R X of each observation."""
-    X = estimates.points[point].T
-    R = estimates.rotations[camera].transpose(1, 2, 0)
-    return np.asarray(R[:, 0] * X[0] + R[:, 1] * X[1] + R[:, 2] * X[2])
+def _columns(values: FloatArray, index: IntArray) -> FloatArray:
+    """(k, N) the k numbers of each chosen camera or point, one after the other in memory."""
+    columns = np.ascontiguousarray(values.reshape(len(values), -1).T)
+    return columns.take(index, axis=1)
+
+
+def _rotated(R: FloatArray, X: FloatArray) -> FloatArray:
+    """(3, N) R X of each observation, of (9, N) rotations and (3, N) points."""
+    rotated: FloatArray = R[::3] * X[0]
+    rotated += R[1::3] * X[1]
+    rotated += R[2::3] * X[2]
+    return rotated
 
 
 def usable(problem: BalProblem, diagnostics: Diagnostics) -> BalPart:
@@ -265,7 +274,8 @@ def usable(problem: BalProblem, diagnostics: Diagnostics) -> BalPart:
     kept = _first_of_pair(problem, diagnostics)
     kept = kept[_in_front(problem.keep(kept), diagnostics)]
     kept = kept[_seen_twice(problem.keep(kept), diagnostics)]
-    for camera in np.setdiff1d(np.arange(problem.cameras), problem.camera[kept]):
+    views = np.bincount(problem.camera[kept], minlength=problem.cameras)
+    for camera in np.flatnonzero(views == 0):
         diagnostics.warn(
             "bal_camera_without_observations",
             f"{problem.name}: camera {camera} sees no point that can be used; it stays as it is",
@@ -279,7 +289,9 @@ def _first_of_pair(problem: BalProblem, diagnostics: Diagnostics) -> IntArray:
     """The first observation of each point in each camera, by camera and then point."""
     pairs = problem.camera * problem.points + problem.point
     _, first = np.unique(pairs, return_index=True)
-    for row in np.setdiff1d(np.arange(len(pairs)), first):
+    repeated = np.ones(len(pairs), bool)
+    repeated[first] = False
+    for row in np.flatnonzero(repeated):
         diagnostics.warn(
             "bal_repeated_observation",
             f"{problem.name}: observation {row}: point {problem.point[row]} in camera "

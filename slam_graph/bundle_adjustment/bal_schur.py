@@ -47,6 +47,8 @@ _MAX_CAMERAS = 1_800
 """The dense reduced system of more cameras needs over 2 GB, and 6 GB to be solved."""
 _MAX_PAIRS = 100_000_000
 """The table of more pairs of observations needs over 1 GB."""
+_BLOCK = 8_000
+"""Observations that are eliminated at a time."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -159,7 +161,8 @@ def normal_equations(cost: BalCost, estimates: BalEstimates) -> NormalEquations:
     """Linearise a cost."""
     linear, part = cost.linearized(estimates), cost.part
     by_camera, by_point = linear.by_camera, linear.by_point
-    rows = np.concatenate([by_camera, linear.r[:, :, None]], axis=2)
+    rows = np.empty((*linear.r.shape, CAMERA_DIM + 1))
+    rows[:, :, :-1], rows[:, :, -1] = by_camera, linear.r
     squares = np.empty((part.problem.cameras, CAMERA_DIM + 1, CAMERA_DIM + 1))
     for camera, (a, b) in enumerate(zip(part.camera_starts, part.camera_starts[1:], strict=False)):
         block = rows[a:b].reshape(-1, CAMERA_DIM + 1)
@@ -175,11 +178,11 @@ def _squares_of_points(
     problem: BalProblem, by_point: FloatArray, r: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Information (P, 3, 3) and gradient (P, 3) of the points, entry by entry."""
-    columns = np.ascontiguousarray(np.concatenate([by_point, r[:, :, None]], axis=2).T)
+    columns = [*by_point.T, r.T]
     sums = np.empty((problem.points, 3, 4))
     for i in range(3):
         for j in range(i, 4):
-            products = columns[i, 0] * columns[j, 0] + columns[i, 1] * columns[j, 1]
+            products = columns[i][0] * columns[j][0] + columns[i][1] * columns[j][1]
             sums[:, i, j] = np.bincount(problem.point, products, problem.points)
             if j < 3:
                 sums[:, j, i] = sums[:, i, j]
@@ -197,8 +200,7 @@ def damped_step(
     problem, E = cost.part.problem, cost.variables
     D_p = _positive(np.diagonal(equations.V, axis1=1, axis2=2))
     inverse_root = _inverse_root(equations.V + damping * D_p[:, :, None] * np.eye(3))
-    K = inverse_root[problem.point] @ equations.by_point.transpose(0, 2, 1)
-    B = K @ equations.by_camera
+    B = _eliminated(inverse_root, problem.point, equations)
     b_p = np.einsum("pij,pj->pi", inverse_root, equations.g_p)
 
     S, g = _reduced_system(cost, fixed, equations, B, b_p[problem.point])
@@ -213,6 +215,26 @@ def damped_step(
     slope = np.sum(equations.g_c * by_camera) + np.sum(equations.g_p * by_point)
     held = damping * (np.sum(D_c * δ**2) + np.sum(D_p * by_point**2)) + along_gauge
     return BalStep(by_camera, by_point, 0.5 * float(held - slope))
+
+
+def _eliminated(
+    inverse_root: FloatArray, point: IntArray, equations: NormalEquations
+) -> FloatArray:
+    """B (N, 3, 9) of each observation, with L⁻¹ (P, 3, 3) of each point."""
+    roots = np.ascontiguousarray(inverse_root.transpose(1, 2, 0))
+    J_p, J_c = equations.by_point.transpose(1, 2, 0), equations.by_camera.transpose(1, 2, 0)
+    B = np.empty((len(point), 3, CAMERA_DIM))
+    for first in range(0, len(point), _BLOCK):  # which stays in the cache of the processor
+        some = slice(first, first + _BLOCK)
+        root, columns = roots.take(point[some], axis=2), np.empty((3, CAMERA_DIM, len(B[some])))
+        for k, column in enumerate(columns):
+            K = root[k, 0] * J_p[:, 0, some]
+            for i in range(1, k + 1):
+                K += root[k, i] * J_p[:, i, some]
+            np.multiply(K[0], J_c[0, :, some], out=column)
+            column += K[1] * J_c[1, :, some]
+        B[some] = columns.transpose(2, 0, 1)
+    return B
 
 
 def _inverse_root(V: FloatArray) -> FloatArray:
