@@ -19,6 +19,7 @@ from scipy.linalg import blas, lapack
 
 from slam_graph.arrays import FloatArray
 from slam_graph.backend.solve.square_root import SquareRootInformation
+from slam_graph.backend.solve.triangles import lower_part
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -36,7 +37,7 @@ class TailRoot:
     @staticmethod
     def of(gaussian: SquareRootInformation, first: int) -> TailRoot:
         """That of all columns from one on."""
-        return TailRoot(first, np.tril(gaussian.root_from(first)))
+        return TailRoot(first, lower_part(gaussian.root_from(first)))
 
     def from_column(self, first: int) -> FloatArray:
         """The root of the columns from a later one on."""

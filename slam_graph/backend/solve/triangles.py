@@ -62,11 +62,26 @@ def upper_part(values: FloatArray) -> FloatArray:
     By their bits, whatever values are below: `np.where` and `np.triu` take three times as long.
     """
     m, n = values.shape
-    mask = _upper_bits(-(-n // _ROUNDED) * _ROUNDED)[:m, :n]
-    return (values.view(np.int64) & mask).view(np.float64)
+    return (values.view(np.int64) & _upper_bits(_rounded(n))[:m, :n]).view(np.float64)
+
+
+def lower_part(values: FloatArray) -> FloatArray:
+    """A copy of a square matrix, column by column in memory, with zeros above the diagonal."""
+    n = len(values)
+    return (values.view(np.int64) & _lower_bits(_rounded(n))[:n, :n]).view(np.float64)
+
+
+def _rounded(n: int) -> int:
+    return -(-n // _ROUNDED) * _ROUNDED
 
 
 @lru_cache(maxsize=8)
 def _upper_bits(n: int) -> IntArray:
     """(n, n) all bits where an upper triangle is."""
     return np.asfortranarray(-np.tri(n, dtype=np.int64).T)
+
+
+@lru_cache(maxsize=8)
+def _lower_bits(n: int) -> IntArray:
+    """(n, n) all bits where a lower triangle is."""
+    return np.asfortranarray(-np.tri(n, dtype=np.int64))
