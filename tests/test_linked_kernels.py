@@ -43,8 +43,7 @@ _ONE_MODULE = """
 import sys
 from pathlib import Path
 from slam_graph.kernels import linking
-linking._modules = lambda part: ["ascending"]
-linking.main(0, Path(sys.argv[1]))
+linking.main(0, Path(sys.argv[1]), ["ascending"])
 """
 
 
@@ -132,7 +131,7 @@ def test_what_fails_is_not_tried_again(tmp_path: Path, monkeypatch: pytest.Monke
     library_making.make(paths)
     said = (tmp_path / "kernels-0.failed").read_text(encoding="utf-8")
     assert said.count("no_such_module") == len(paths)
-    monkeypatch.setattr(library_making, "_run", lambda commands: pytest.fail("tried again"))
+    monkeypatch.setattr(library_making, "_run", lambda *_: pytest.fail("tried again"))
     library_making.make(paths)
 
 
@@ -156,7 +155,7 @@ def test_an_old_failure_is_tried_again(tmp_path: Path, monkeypatch: pytest.Monke
     failed.touch()
     os.utime(failed, (0, 0))
     tried: list[int] = []
-    monkeypatch.setattr(library_making, "_run", lambda commands: tried.append(len(commands)))
+    monkeypatch.setattr(library_making, "_run", lambda commands, *_: tried.append(len(commands)))
     library_making.make([tmp_path / "kernels-0.so"])
     assert tried == [1]
 

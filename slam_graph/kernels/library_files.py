@@ -13,7 +13,7 @@ from functools import cache
 from importlib.util import find_spec, source_hash
 from pathlib import Path
 
-__all__ = ["PARTS", "library_paths", "module_name", "processor"]
+__all__ = ["PARTS", "kernel_modules", "library_paths", "module_name", "processor"]
 
 PARTS = 2
 """Libraries that are made at the same time, each by a process of its own."""
@@ -35,6 +35,13 @@ def library_paths() -> list[Path]:
 def module_name(part: int) -> str:
     """The name that a library has as a module of Python."""
     return f"slam_graph_kernels_{part}"
+
+
+def kernel_modules() -> list[str]:
+    """Names of the modules that have kernels, at most 256, the largest first."""
+    sources = {p.stem: p.read_bytes() for p in Path(__file__).parent.glob("*.py")}
+    names = sorted(name for name, source in sources.items() if b"\n@compiled(" in source)
+    return sorted(names, key=lambda name: len(sources[name]), reverse=True)
 
 
 @cache

@@ -19,6 +19,7 @@ from pathlib import Path
 from tempfile import TemporaryFile
 
 from slam_graph.interrupts import Interrupts
+from slam_graph.kernels.library_files import kernel_modules
 from slam_graph.kernels.python_process import command_of, inherited_imports
 
 __all__ = ["make"]
@@ -45,26 +46,47 @@ def make(paths: list[Path]) -> None:
     Raises:
         OSError: if nothing can be stored in their folder.
     """
-    commands = [command_of(_LINKING, str(part), str(path)) for part, path in enumerate(paths)]
-    given = [command for command in commands if command is not None]
-    if len(given) < len(paths) or not _tools_are_there():
+    if command_of(_LINKING) is None or not _tools_are_there():
         return
-    with _alone_in(paths[0].parent):
+    with _alone_in(paths[0].parent), _queue() as queue:
         failed = paths[0].with_suffix(_FAILED)
         if _is_recent(failed, _RETRY_S) or all(path.is_file() for path in paths):
             return
         logger.warning("compiling kernels: once on this machine, up to a minute")
-        errors = _run(given)
+        commands = [
+            command_of(_LINKING, str(part), str(path), str(queue))
+            for part, path in enumerate(paths)
+        ]
+        errors = _run([command for command in commands if command is not None], queue)
         if errors:
             failed.write_text(errors, encoding="utf-8")
             logger.warning("kernels cannot be linked (%s); Numba compiles them", failed)
         _remove_stale(paths[0].parent)
 
 
-def _run(commands: list[list[str]]) -> str:
+@contextmanager
+def _queue() -> Iterator[int]:
+    """A pipe from which processes take the modules of kernels, by their numbers of one byte.
+
+    What a kernel takes to compile is seen only then.
+    """
+    taken, given = os.pipe()
+    os.write(given, bytes(range(len(kernel_modules()))))
+    os.close(given)
+    try:
+        yield taken
+    finally:
+        os.close(taken)
+
+
+def _run(commands: list[list[str]], *inherited: int) -> str:
     """Run commands at the same time; what those that failed have said.
 
     They end with this process. Ctrl-C is for this one alone, also within a block that defers it.
+
+    Args:
+        commands: program and arguments.
+        inherited: file descriptors that the commands read from.
 
     Raises:
         KeyboardInterrupt: after Ctrl-C.
@@ -81,6 +103,7 @@ def _run(commands: list[list[str]]) -> str:
                 stderr=said,
                 env=environment,
                 start_new_session=True,
+                pass_fds=inherited,
             )
             stack.callback(_end, process)
             started.append((process, said))
