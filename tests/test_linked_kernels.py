@@ -39,11 +39,11 @@ depths = ray_depths(np.eye(3), np.ones(3), rng.normal(size=(50, 2)), rng.normal(
 print("numba" in sys.modules, distances.tobytes().hex(), depths.tobytes().hex())
 """
 
-_ONE_MODULE = """
+_MODULES = """
 import sys
 from pathlib import Path
 from slam_graph.kernels import linking
-linking.main(0, Path(sys.argv[1]), ["ascending"])
+linking.main(0, Path(sys.argv[1]), sys.argv[2:])
 """
 
 
@@ -119,10 +119,18 @@ def test_other_wrong_arguments_are_refused() -> None:
 
 def test_a_library_can_be_made_anywhere(tmp_path: Path) -> None:
     path = tmp_path / f"made{library_files._SUFFIX}"
-    _output(_ONE_MODULE, str(path))
+    _output(_MODULES, str(path), "ascending")
     assert list(tmp_path.iterdir()) == [path]
     library = linked._loaded(path, library_files.module_name(0))
     assert library.are_among(np.arange(4), np.array([1, 3])).tolist() == [False, True, False, True]
+
+
+def test_a_module_that_another_one_imports_keeps_its_kernels(tmp_path: Path) -> None:
+    path = tmp_path / f"made{library_files._SUFFIX}"
+    _output(_MODULES, str(path), "state_rows", "null_space")
+    library = linked._loaded(path, library_files.module_name(0))
+    names = [name for name in dir(library) if not name.startswith("_")]
+    assert names == ["fill_state_rows", "triangularize_features"]
 
 
 def test_what_fails_is_not_tried_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -55,11 +55,14 @@ def main(part: int, path: Path, names: Iterable[str]) -> None:
 
 
 def _kernels(names: Iterable[str]) -> Iterator[tuple[Any, str]]:
-    """The kernels of modules and their signatures, without those of modules that they import."""
+    """The kernels of modules and their signatures.
+
+    A module may have been imported by one before it, of which its kernels are no part.
+    """
+    collected = compilation.collected = []
     for name in names:
-        compilation.collected = []
         module = import_module(f"slam_graph.kernels.{name}").__name__
-        yield from (k for k in compilation.collected if k[0].py_func.__module__ == module)
+        yield from [k for k in collected if k[0].py_func.__module__ == module]
 
 
 def _taken(queue: int) -> Iterator[str]:
