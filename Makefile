@@ -4,6 +4,7 @@ PYTHON ?= python3
 DATA ?= demo
 GROUNDTRUTH ?=
 ARGS ?=
+PIP_ARGS ?=
 
 VENV := .venv
 BIN := $(VENV)/bin
@@ -83,5 +84,5 @@ define install
 $(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { \
   echo "error: slam_graph needs Python 3.11 or newer, $(PYTHON) is not; say PYTHON=path" >&2; exit 1; } ; \
 echo "Installing into $(VENV); the first time takes a minute or two." >&2; \
-$(PYTHON) -m venv $(VENV) && $(PIP) install --quiet -c constraints.txt -e '$(1)'
+$(PYTHON) -m venv $(VENV) && $(PIP) install --quiet $(PIP_ARGS) -c constraints.txt -e '$(1)'
 endef
