@@ -17,8 +17,9 @@ from benchmarks.real_imu import CAMERA, CAMERAS
 from benchmarks.recordings import FIRST_HELD_OUT_SEED, HELD_OUT
 from benchmarks.running import Run
 from benchmarks.suite import CORE, Benchmark, Outcome
+from slam_graph.datasets.sequence import Sequence
 from slam_graph.evaluation.consistency import mean_bounds
-from slam_graph.experiment.tasks import Source, find_sources
+from slam_graph.experiment.tasks import find_sources
 
 CLIP_S = 30.0
 
@@ -34,11 +35,13 @@ and yaw of the start do not define the world."""
 def measure(data: Path) -> Outcome:
     """Errors on the flights after alignment in SE(3); errors and NEES over the seeds without."""
     outcome = Outcome()
-    flights = find_sources([f"sim:{data / path}" for path in HELD_OUT], CLIP_S, CAMERA)
+    sources = find_sources([f"sim:{data / path}" for path in HELD_OUT], CLIP_S, CAMERA)
+    flights = [(source, source.open(FIRST_HELD_OUT_SEED, CAMERAS)) for source in sources]
     (simulated,) = find_sources(["sim:figure8"], SIMULATED_S, SIMULATED)
+    drawn = [simulated.open(seed, CAMERAS) for seed in SEEDS]
     for name in CORE:
-        for source in flights:
-            run = Run(source.open(FIRST_HELD_OUT_SEED, CAMERAS), name, CAMERAS)
+        for source, flight in flights:
+            run = Run(flight, name, CAMERAS)
             errors = run.errors("se3")
             figures = [
                 Metric("ate", errors.position_m, "m", "lower"),
@@ -46,7 +49,7 @@ def measure(data: Path) -> Outcome:
             ]
             outcome.add(f"{source.name.removeprefix('sim_')}.{name}", figures, held_out=True)
             outcome.notes += run.notes()
-        outcome.add(f"seeds.{name}", over_seeds(simulated, name), held_out=True)
+        outcome.add(f"seeds.{name}", over_seeds(drawn, name), held_out=True)
     outcome.notes.append(
         f"the first {CLIP_S:g} s of each flight; seeds {SEEDS[0]} to {SEEDS[-1]} of "
         f"{SIMULATED_S:g} s"
@@ -54,11 +57,9 @@ def measure(data: Path) -> Outcome:
     return outcome
 
 
-def over_seeds(source: Source, algorithm: str) -> list[Metric]:
+def over_seeds(flights: list[Sequence], algorithm: str) -> list[Metric]:
     """Mean errors without alignment, and mean NEES with its upper χ² bound."""
-    runs = [
-        Run(source.open(seed, CAMERAS), algorithm, CAMERAS, overrides=DRAWN_START) for seed in SEEDS
-    ]
+    runs = [Run(flight, algorithm, CAMERAS, overrides=DRAWN_START) for flight in flights]
     errors = [run.errors("none") for run in runs]
     nees = np.array([mean_nees(run) for run in runs])
     bound = mean_bounds(3, len(SEEDS))[1]

@@ -89,45 +89,49 @@ class RotationFit:
 
 @dataclass(frozen=True, eq=False)
 class _Turned:
-    """Bearings of both frames of P pairs in the camera of the first one.
+    """Bearings of both frames of P pairs in the camera of the first one; features are last.
 
     Attributes:
-        one, two: (P, N, 3) bearings f₁ and R f₂.
-        by_one, by_two: (P, N, 3, 2) their derivatives by the pixels.
+        one, two: (P, 3, N) bearings f₁ and R f₂.
+        by_one, by_two: (P, 2, 3, N) their derivatives by the pixels.
+        least: (P, N) variance of t · n that is assumed at least.
     """
 
     one: FloatArray
     two: FloatArray
     by_one: FloatArray
     by_two: FloatArray
+    least: FloatArray
 
     @cached_property
     def normals(self) -> FloatArray:
-        """(P, N, 3) f₁ × R f₂ of the features."""
-        return np.cross(self.one, self.two)
+        """(P, 3, N) f₁ × R f₂ of the features."""
+        return _cross(self.one, self.two)
 
     @cached_property
-    def noise(self) -> FloatArray:
-        """(P, N, 3, 3) covariances of the normals for pixels with unit noise."""
-        spread = skew(-self.two) @ self.by_one, skew(self.one) @ self.by_two
-        return np.asarray(sum(part @ part.swapaxes(-1, -2) for part in spread))
+    def spread(self) -> FloatArray:
+        """(P, 3, 4 N) how normals change with each of the four coordinates of both pixels."""
+        one, two = self.one[:, None], self.two[:, None]
+        parts = np.concatenate([_cross(self.by_one, two), _cross(one, self.by_two)], axis=1)
+        return parts.transpose(0, 2, 1, 3).reshape(len(parts), 3, -1)
 
-    @cached_property
-    def _squared_derivatives(self) -> FloatArray:
-        """(P, N) squared derivatives of the bearings, summed."""
-        parts = (self.by_one, self.by_two)
-        return np.asarray(sum(np.einsum("pnij,pnij->pn", part, part) for part in parts))
+    def moments(self, weights: FloatArray) -> FloatArray:
+        """Weighted sum (P, 3, 3) of the covariances of the normals for pixels with unit noise."""
+        return _scatter(self.spread, np.tile(weights, 4))
 
     def distances(self, t: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Epipolar distances (P, N), pixels, and the deviations of t · n that they are units of."""
-        along = skew(t)
-        by_pixels = (
-            np.einsum("pni,pnij->pnj", self.two @ along, self.by_one),
-            np.einsum("pni,pnij->pnj", self.one @ along, self.by_two),
-        )
-        variance = sum(np.einsum("pnj,pnj->pn", part, part) for part in by_pixels)
-        sigma = np.sqrt(np.maximum(variance, _LEAST_VARIANCE * self._squared_derivatives + 1e-12))
-        return np.einsum("pni,pi->pn", self.normals, t) / sigma, sigma
+        sigma = np.sqrt(np.maximum(np.sum(self._along(t) ** 2, axis=1), self.least))
+        return (t[:, None] @ self.normals)[:, 0] / sigma, sigma
+
+    def variance_slopes(self, t: FloatArray) -> FloatArray:
+        """(P, 3, N) half the derivatives of the variances of t · n by t."""
+        spread = self.spread.reshape(len(t), 3, 4, -1)
+        return np.asarray(np.sum(spread * self._along(t)[:, None], axis=2))
+
+    def _along(self, t: FloatArray) -> FloatArray:
+        """(P, 4, N) how t · n changes with each of the four coordinates of both pixels."""
+        return np.asarray((t[:, None] @ self.spread).reshape(len(t), 4, -1))
 
 
 class RotationProblem:
@@ -140,41 +144,50 @@ class RotationProblem:
         self._mounted, self._gyroscopes = camera, gyroscopes
         most = max(len(pair.first) for pair in pairs)
         centre = np.array([camera.camera.cx, camera.camera.cy])
-        self._pixels = np.tile(centre, (2, len(pairs), most, 1))
+        pixels = np.tile(centre, (2, len(pairs), most, 1))
         self._there = np.zeros((len(pairs), most), bool)
         for p, pair in enumerate(pairs):
-            self._pixels[0, p, : len(pair.first)] = pair.first
-            self._pixels[1, p, : len(pair.first)] = pair.second
+            pixels[0, p, : len(pair.first)] = pair.first
+            pixels[1, p, : len(pair.first)] = pair.second
             self._there[p, : len(pair.first)] = True
+        both = np.broadcast_to(self._there, pixels.shape[:3])
+        self._pixels = np.vstack([centre, pixels[both]])  # each once; the first one fills up
+        self._place = np.zeros(both.shape, int)
+        self._place[both] = np.arange(1, len(self._pixels))
         self._t = np.array([[pair.first_s for pair in pairs], [pair.second_s for pair in pairs]])
         self._part = np.array([pair.part for pair in pairs])
         blocks = [(pair.part, int(pair.first_s // _BLOCK_S)) for pair in pairs]
         self._block = np.unique(blocks, axis=0, return_inverse=True)[1].ravel()
-        rows = self._pixels[..., 1] / camera.camera.height - 0.5
+        rows = pixels[..., 1] / camera.camera.height - 0.5
         self._row = np.where(self._there, rows, 0.0)
-        self._bearings: dict[float, tuple[FloatArray, FloatArray, BoolArray]] = {}
+        self._bearings: dict[float, tuple[FloatArray, FloatArray, FloatArray, BoolArray]] = {}
         self._turns: dict[float, tuple[FloatArray, FloatArray, FloatArray]] = {}
         self._latest: tuple[Kinematics, _Turned] | None = None
 
-    def bearings(self, focal: float) -> tuple[FloatArray, FloatArray, BoolArray]:
-        """Unit bearings (2, P, N, 3) with a factor on the focal lengths, and their derivatives.
+    def bearings(self, focal: float) -> tuple[FloatArray, FloatArray, FloatArray, BoolArray]:
+        """Unit bearings (2, P, 3, N) with a factor on the focal lengths, and their derivatives.
 
-        The derivatives (2, P, N, 3, 2) are by the pixels. Last, which features (P, N) have both in
-        both frames: beyond the edge of a wide lens there is none.
+        The derivatives (2, P, 2, 3, N) are by the pixels. Then the least variance (P, N) of t · n,
+        and which features (P, N) have both bearings: beyond the edge of a wide lens there is none.
         """
         if focal not in self._bearings:
             camera = self._mounted.camera
             scaled = replace(camera, fx=camera.fx * focal, fy=camera.fy * focal)
-            moved = self._pixels[None] + _PIXEL_STEPS[:, None, None, None]
+            moved = self._pixels + _PIXEL_STEPS[:, None]
             points, visible = scaled.visible(moved.reshape(-1, 2))
-            m = points.reshape(moved.shape)
-            rays = np.concatenate([m, np.ones((*m.shape[:-1], 1))], axis=-1)
-            rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
-            known = self._there & np.all(visible.reshape(m.shape[:-1]), axis=(0, 1))
-            slopes = np.stack([rays[1] - rays[0], rays[2] - rays[0]], axis=-1)
+            x, y = np.moveaxis(points.reshape(moved.shape), -1, 0)
+            rays = np.stack([x, y, np.ones_like(x)], axis=1) / np.sqrt(x**2 + y**2 + 1.0)[:, None]
+            slopes = rays[1:] - rays[0]
+            least = _LEAST_VARIANCE * np.sum(slopes**2, axis=(0, 1))[self._place] + 5e-13
+            known = np.all(visible.reshape(x.shape), axis=0)[self._place]
             if len(self._bearings) > 4:
                 self._bearings.clear()
-            self._bearings[focal] = rays[0], slopes, known
+            self._bearings[focal] = (
+                np.moveaxis(rays[0][:, self._place], 0, 2),
+                np.moveaxis(slopes[:, :, self._place], (0, 1), (2, 3)),
+                least.sum(axis=0),
+                self._there & known.all(axis=0),
+            )
         return self._bearings[focal]
 
     def _turned(self, at: Kinematics) -> _Turned:
@@ -188,19 +201,18 @@ class RotationProblem:
 
     def _turned_at(self, at: Kinematics) -> _Turned:
         """`_turned` computed anew."""
-        f, slopes, _ = self.bearings(at.focal)
+        f, slopes, least, _ = self.bearings(at.focal)
         C, (body, halfway, rates) = at.body_R_camera, self._gyroscope_turns(at.offset_s)
         if at.readout_s != 0.0:
             seconds, rates = self._row * at.readout_s, (rates - at.bias) / at.scale
-            f = f + np.cross((rates @ C)[:, :, None, :] * seconds[..., None], f)
+            f = f + skew(rates @ C) @ f * seconds[:, :, None]
         by_bias = (at.bias * (self._t[1] - self._t[0])[:, None])[..., None]
         body = body @ Rotation.from_rotvec(-(halfway @ by_bias)[..., 0]).as_matrix()
         if at.scale != 1.0:
             body = Rotation.from_rotvec(Rotation.from_matrix(body).as_rotvec() / at.scale)
             body = body.as_matrix()
         camera = C.T @ body @ C
-        two = f[1] @ camera.transpose(0, 2, 1)
-        return _Turned(f[0], two, slopes[0], camera[:, None] @ slopes[1])
+        return _Turned(f[0], camera @ f[1], slopes[0], camera[:, None] @ slopes[1], least)
 
     def _gyroscope_turns(self, offset_s: float) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Rotations (P, 3, 3) from the second body of each pair to the first, by the gyroscope.
@@ -224,14 +236,14 @@ class RotationProblem:
 
     def directions(self, at: Kinematics, noise: float) -> FloatArray:
         """Directions (P, 3) of the translations that fit best, robustly."""
-        turned, known = self._turned(at), self.bearings(at.focal)[2]
-        weights = known / np.maximum(np.sum(turned.normals**2, axis=-1), 1e-6)
+        turned, known = self._turned(at), self.bearings(at.focal)[3]
+        weights = known / np.maximum(np.sum(turned.normals**2, axis=1), 1e-6)
         t = _least(_scatter(turned.normals, weights))
         for _ in range(_DIRECTIONS):
             e, sigma = turned.distances(t)
             scale = np.maximum(_scales(np.abs(e), known), noise)[:, None]
             weights = known / (1.0 + (e / (_CAUCHY * scale)) ** 2) / sigma**2
-            by_noise = np.einsum("pn,pnij->pij", weights * e**2, turned.noise)
+            by_noise = turned.moments(weights * e**2)
             t = _least(_scatter(turned.normals, weights) - by_noise)
         return t
 
@@ -240,12 +252,12 @@ class RotationProblem:
         return self._turned(at).distances(t)[0]
 
     def residuals(self, at: Kinematics, t: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Epipolar distances (P, N), pixels, and their derivatives (P, N, 2) by the directions."""
-        turned, tangents = self._turned(at), _tangents(t)
+        """Epipolar distances (P, N), pixels, and their derivatives (P, 2, N) by the directions."""
+        turned, tangents = self._turned(at), _tangents(t).transpose(0, 2, 1)
         e, sigma = turned.distances(t)
-        by_sigma = np.einsum("pnij,pj->pni", turned.noise, t) @ tangents
-        by_t = (turned.normals @ tangents) / sigma[..., None]
-        return e, by_t - by_sigma * (e / sigma**2)[..., None]
+        by_sigma = tangents @ turned.variance_slopes(t)
+        by_t = tangents @ turned.normals / sigma[:, None]
+        return e, by_t - by_sigma * (e / sigma**2)[:, None]
 
     def noise_px(self, at: Kinematics) -> float:
         """Robust standard deviation of the epipolar distances, the directions fitted."""
@@ -269,7 +281,7 @@ class RotationProblem:
         They must not count as if they fitted: a focal length that puts them beyond the edge of a
         wide lens would look better for each of them.
         """
-        known = self.bearings(at.focal)[2]
+        known = self.bearings(at.focal)[3]
         return np.asarray(np.where(known, self.distances(at, t), beyond_px)[self._there])
 
     def solve(
@@ -324,28 +336,35 @@ class RotationProblem:
         """Information (B, n, n) without the directions, and gradients (B, n), of blocks of time."""
         t = self.directions(at, noise)
         e, by_t = self.residuals(at, t)
-        J, known = np.empty((*e.shape, len(columns))), self.bearings(at.focal)[2]
+        J, known = np.empty((len(e), len(columns), e.shape[1])), self.bearings(at.focal)[3]
         for c, k in enumerate(columns):
             change = np.zeros(len(WITH_SCALE))
             change[k] = _STEP[k]
             moved = at.moved(change)
-            J[..., c] = (self.distances(moved, t) - e) / _STEP[k]
-            known = known & self.bearings(moved.focal)[2]
+            J[:, c] = (self.distances(moved, t) - e) / _STEP[k]
+            known = known & self.bearings(moved.focal)[3]
         root = np.sqrt(known / (1.0 + (e / (_CAUCHY * noise)) ** 2)) / noise
-        e, J, by_t = e * root, J * root[..., None], by_t * root[..., None]
-        inner = by_t.transpose(0, 2, 1) @ by_t + 1e-9 * np.eye(2)
-        gradients = np.einsum("pni,pn->pi", J, e)  # the directions are at their best: none by them
-        J = J - by_t @ np.linalg.solve(inner, by_t.transpose(0, 2, 1) @ J)
+        e, J, by_t = e * root, J * root[:, None], by_t * root[:, None]
+        inner = by_t @ by_t.transpose(0, 2, 1) + 1e-9 * np.eye(2)
+        gradients = (J @ e[..., None])[..., 0]  # the directions are at their best: none by them
+        J = J - np.linalg.solve(inner, by_t @ J.transpose(0, 2, 1)).transpose(0, 2, 1) @ by_t
         blocks, n = int(self._block.max()) + 1, len(columns)
         information, scores = np.zeros((blocks, n, n)), np.zeros((blocks, n))
-        np.add.at(information, self._block, J.transpose(0, 2, 1) @ J)
+        np.add.at(information, self._block, J @ J.transpose(0, 2, 1))
         np.add.at(scores, self._block, gradients)
         return information, scores
 
 
+def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
+    """The products a × b of vectors (..., 3, N)."""
+    x, y, z = (a[..., k, :] for k in range(3))
+    u, v, w = (b[..., k, :] for k in range(3))
+    return np.stack([y * w - z * v, z * u - x * w, x * v - y * u], axis=-2)
+
+
 def _scatter(normals: FloatArray, weights: FloatArray) -> FloatArray:
-    """Weighted second moments (P, 3, 3) of normals (P, N, 3)."""
-    return np.asarray((normals * weights[..., None]).transpose(0, 2, 1) @ normals)
+    """Weighted second moments (P, 3, 3) of normals (P, 3, N)."""
+    return np.asarray((normals * weights[:, None]) @ normals.transpose(0, 2, 1))
 
 
 def _least(moments: FloatArray) -> FloatArray:

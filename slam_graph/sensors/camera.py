@@ -179,9 +179,9 @@ class Camera:
         """
         with np.errstate(all="ignore"):
             plane = self.undistort(pixels)
-            usable = np.linalg.norm(plane, axis=1) < min(max_tangent, self.max_tangent)
+            usable = _lengths(plane) < min(max_tangent, self.max_tangent)
             plane = np.where(usable[:, None], plane, 0.0)
-            error_px = np.linalg.norm(self.pixels(plane) - pixels, axis=1)
+            error_px = _lengths(self.pixels(plane) - pixels)
         return plane, usable & (error_px < _VISIBLE_TOLERANCE_PX)
 
     def visible_mask(self, max_tangent: float = MAX_TANGENT) -> BoolArray:
@@ -189,3 +189,9 @@ class Camera:
         u, v = np.meshgrid(np.arange(self.width), np.arange(self.height))
         pixels = np.column_stack([u.ravel(), v.ravel()]).astype(np.float64)
         return self.visible(pixels, max_tangent)[1].reshape(self.height, self.width)
+
+
+def _lengths(vectors: FloatArray) -> FloatArray:
+    """(N,) lengths of vectors (N, 2); `np.linalg.norm` takes many times as long."""
+    x, y = vectors[:, 0], vectors[:, 1]
+    return np.asarray(np.sqrt(x * x + y * y))
