@@ -12,6 +12,7 @@ features behind the camera, and a wrong baseline has s ≠ 1.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -125,9 +126,10 @@ class Window:
         """
         alpha = np.einsum("kaij,ij->ka", self._of_axes, P)
         mean = np.einsum("aij,ij->a", self._force, P)
-        of_f, of_rest, b = self._equations(alpha, self._m)
+        of_f, of_rest, b = self._equations(alpha, self._as_observed)
         weights, noise = np.ones(len(b)), 1.0 / self._focal_px
-        for iteration in range(_LINEAR + steps):
+        last = _LINEAR + steps - 1
+        for iteration in range(last + 1):
             by_steps = iteration >= _LINEAR
             sigma_s = _FREE_BASELINE if by_steps else _KNOWN_BASELINE
             try:
@@ -139,11 +141,13 @@ class Window:
             seen, depth = self._projected(points, x, alpha)
             size = np.linalg.norm(seen - self._m, axis=1) * self._focal_px
             sigma_px = max(float(np.median(size)) / _MEDIAN_OF_TWO, _LEAST_NOISE_PX)
+            if iteration == last:
+                break
             noise = sigma_px / self._focal_px
             safe = np.where(np.abs(depth) < _LEAST_DEPTH_M, _LEAST_DEPTH_M, depth)
             robust = 1.0 / np.sqrt(1.0 + (size / (_CAUCHY * sigma_px)) ** 2)
             if iteration >= _LINEAR - 1:
-                of_f, of_rest, b = self._equations(alpha, seen)
+                of_f, of_rest, b = self._equations(alpha, self._coefficients(seen))
                 b = b + (self._m - seen) * safe[:, None]
             weights = robust / np.abs(safe)
         s = float(x[_S]), float(np.sqrt(covariance[_S, _S]))
@@ -152,12 +156,26 @@ class Window:
         return WindowSolution(*s, float(np.mean(depth > 0.0)), x[_G], sigma_px)
 
     def _equations(
-        self, alpha: FloatArray, m: FloatArray
+        self, alpha: FloatArray, coefficients: tuple[FloatArray, FloatArray, FloatArray]
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Coefficients of features (N, 2, 3), of v, g, b and s (N, 2, 10), and right sides (N, 2).
+        """The coefficients of features and of v, g, b and s, and right sides (N, 2).
 
         Args:
             alpha: (K, 3) doubly integrated specific force.
+            coefficients: as `_coefficients` returns them.
+        """
+        of_f, of_rest, of_mounting = coefficients
+        return of_f, of_rest, np.einsum("nij,nj->ni", of_f, alpha[self._frame]) + of_mounting
+
+    @cached_property
+    def _as_observed(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """The coefficients for features that are seen where they were observed."""
+        return self._coefficients(self._m)
+
+    def _coefficients(self, m: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Coefficients of features (N, 2, 3), of v, g, b and s (N, 2, 10), and of mounting (N, 2).
+
+        Args:
             m: (N, 2) normalised points that the features are to be seen at.
         """
         k, c = self._frame, self._camera
@@ -169,8 +187,7 @@ class Window:
         t = self._t[k][:, None, None]
         by_s = -np.einsum("nij,nj->ni", in_body, self._places[c] - self._places[0])
         parts = [-of_f * t, -0.5 * of_f * t**2, of_f @ self._by_bias[k], by_s[..., None]]
-        b = np.einsum("nij,nj->ni", of_f, alpha[k]) + in_body @ self._places[0]
-        return of_f, np.concatenate(parts, axis=2), b
+        return of_f, np.concatenate(parts, axis=2), in_body @ self._places[0]
 
     def _solved(
         self,
