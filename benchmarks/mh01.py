@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.metric import EXACT, QUANTISED_TOLERANCE, Metric, info
-from benchmarks.running import Errors, Run, clipped, within
+from benchmarks.running import Errors, Run, clipped, decoded_once, within
 from benchmarks.suite import CORE, PEERS, UNBOUNDED, Benchmark, Outcome
 from slam_graph.datasets.groundtruth import read_groundtruth
 from slam_graph.geometry.trajectory import Trajectory
@@ -39,6 +39,7 @@ OTHERS = {
 """Files of causal estimates of others by their name, for each number of cameras."""
 
 
+@decoded_once()
 def measure(data: Path, cameras: int, algorithms: Sequence[str]) -> Outcome:
     """Start-up, errors after alignment in SE(3), and lost frames; then the others' errors."""
     outcome = Outcome()

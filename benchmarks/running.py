@@ -5,7 +5,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,6 +15,7 @@ from threadpoolctl import threadpool_limits
 from slam_graph.config import load_config
 from slam_graph.datasets.dataset_registry import open_dataset
 from slam_graph.datasets.sequence import Sequence
+from slam_graph.datasets.streams import images
 from slam_graph.evaluation.absolute_pose_error import ape
 from slam_graph.evaluation.choices import PoseRelation
 from slam_graph.geometry.trajectory import Trajectory
@@ -136,6 +138,27 @@ class _StateCounter(NullViewer):
         """Look whether there is a state."""
         self._started |= frame.state is not None
         self.waited += not self._started
+
+
+@contextmanager
+def decoded_once() -> Iterator[None]:
+    """Within it an image file is decoded when it is read first: for several runs over the same."""
+    decode = images.decode_grey
+    decoded: dict[str, images.Image | images.Fault] = {}
+
+    def remembered(data: bytes, where: str) -> images.Image | images.Fault:
+        if where not in decoded:
+            image = decode(data, where)
+            if not isinstance(image, images.Fault):
+                image.flags.writeable = False  # a run that changed it would change the next one
+            decoded[where] = image
+        return decoded[where]
+
+    images.decode_grey = remembered
+    try:
+        yield
+    finally:
+        images.decode_grey = decode
 
 
 def clipped(algorithm: str, duration_s: float | None) -> str:
