@@ -25,6 +25,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import IO, Any
 
+import typer.main
 from limits import HANG_S
 
 IMPORTED = (
@@ -91,6 +92,8 @@ def _serve() -> None:
     gc.disable()
     for name in IMPORTED:
         import_module(name)
+    typer.main.get_command = cache(typer.main.get_command)
+    typer.main.get_command(import_module("slam_graph.cli.main").app)
     gc.freeze()  # else each child looks at all that was imported when it ends, for half a second
     gc.enable()
     for line in sys.stdin:

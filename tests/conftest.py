@@ -4,6 +4,7 @@
 
 import logging
 import os
+from functools import cache
 from importlib import import_module
 from pathlib import Path
 from pkgutil import iter_modules
@@ -11,11 +12,18 @@ from typing import TYPE_CHECKING
 
 import gtsam
 import pytest
+import typer.main
+import typer.testing
 
 import slam_graph.kernels
 
 if TYPE_CHECKING:
     from documented_stock import Stock
+
+
+def pytest_configure() -> None:
+    """The command line is put together once, instead of by each command that a test gives."""
+    typer.main.get_command = typer.testing._get_command = cache(typer.main.get_command)
 
 
 def pytest_sessionstart(session: pytest.Session) -> None:
