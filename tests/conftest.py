@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Fixtures shared by all tests: where the recordings are; kernels that are compiled."""
 
+import gc
 import logging
 import os
 from functools import cache
@@ -34,7 +35,7 @@ def pytest_sessionstart(session: pytest.Session) -> None:
 
 
 LONGEST = (
-    "damaged_files", "verdict", "recovery", "diagnosis", "experiment", "map_runs", "notebooks",
+    "damaged_files", "experiment", "verdict", "recovery", "diagnosis", "map_runs", "notebooks",
     "position_fixes", "estimator_end_to_end", "clock_monitor", "rerun", "repeats", "signals",
     "one_camera", "final_ba", "take_off", "rolling_shutter", "view_damaged", "damaged_results",
 )  # fmt: skip
@@ -46,6 +47,11 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Long files first; otherwise the order stays. Xdist deals out files in this order."""
     first = {f"test_{name}.py": place for place, name in enumerate(LONGEST)}
     items.sort(key=lambda item: first.get(item.path.name, len(first)))
+
+
+def pytest_collection_finish() -> None:
+    """No search for cycles among what was imported and collected: it stays to the end."""
+    gc.freeze()
 
 
 @pytest.fixture(scope="session")
