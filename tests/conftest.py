@@ -35,9 +35,9 @@ def pytest_sessionstart(session: pytest.Session) -> None:
 
 
 LONGEST = (
-    "damaged_files", "experiment", "verdict", "recovery", "diagnosis", "map_runs", "notebooks",
-    "position_fixes", "estimator_end_to_end", "clock_monitor", "rerun", "repeats", "signals",
-    "one_camera", "final_ba", "take_off", "rolling_shutter", "view_damaged", "damaged_results",
+    "damaged_files", "experiment", "verdict", "recovery", "batch", "diagnosis", "map_runs",
+    "notebooks", "estimator_end_to_end", "position_fixes", "clock_monitor", "signals", "rerun",
+    "take_off", "repeats", "final_ba", "one_camera", "rolling_shutter", "damaged_results",
 )  # fmt: skip
 """Files of tests that take longest in the quick group; they run first, so that no core ends with
 one."""
