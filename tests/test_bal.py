@@ -34,7 +34,7 @@ from slam_graph.bundle_adjustment.bal_schur import (
 )
 from slam_graph.bundle_adjustment.bal_solve import adjust_bundle
 from slam_graph.diagnostics import Diagnostics
-from slam_graph.errors import EstimationError
+from slam_graph.errors import DataError, EstimationError
 
 TIGHT = BalStepsPolicy(tolerance=1e-12)
 
@@ -215,6 +215,15 @@ def test_a_robust_loss_holds_outliers_back(robust: str) -> None:
         used = np.isin(truth.point, solution.part.points) & ~false
         errors[loss] = np.median(reprojection_errors(truth.keep(used), solution.estimates))
     assert errors[robust] < 0.5 * errors["none"]
+
+
+def test_a_problem_of_nothing_says_so() -> None:
+    some = ring(3, 20).problem
+    none = np.zeros(0, np.int64)
+    for cameras, points in ((none, np.arange(20)), (np.arange(3), none), (none, none)):
+        nothing = replace(some.keep(none), estimates=some.estimates.select(cameras, points))
+        with pytest.raises(DataError, match="no point is in front of two cameras"):
+            adjust_bundle(nothing)
 
 
 def test_what_cannot_be_estimated_stays_and_is_counted() -> None:

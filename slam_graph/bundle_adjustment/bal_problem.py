@@ -14,6 +14,7 @@ the frame of the world are arbitrary: a similarity of the world changes no pixel
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -249,8 +250,8 @@ def linearize(
 
 def _columns(values: FloatArray, index: IntArray) -> FloatArray:
     """(k, N) the k numbers of each chosen camera or point, one after the other in memory."""
-    columns = np.ascontiguousarray(values.reshape(len(values), -1).T)
-    return columns.take(index, axis=1)
+    rows = values.reshape(len(values), math.prod(values.shape[1:]))
+    return np.ascontiguousarray(rows.T).take(index, axis=1)
 
 
 def _rotated(R: FloatArray, X: FloatArray) -> FloatArray:
