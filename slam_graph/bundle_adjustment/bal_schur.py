@@ -48,7 +48,7 @@ _MAX_CAMERAS = 1_800
 _MAX_PAIRS = 100_000_000
 """The table of more pairs of observations needs over 1 GB."""
 _BLOCK = 8_000
-"""Observations that are eliminated at a time."""
+"""Observations whose B are computed at a time."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -224,7 +224,7 @@ def _eliminated(
     roots = np.ascontiguousarray(inverse_root.transpose(1, 2, 0))
     J_p, J_c = equations.by_point.transpose(1, 2, 0), equations.by_camera.transpose(1, 2, 0)
     B = np.empty((len(point), 3, CAMERA_DIM))
-    for first in range(0, len(point), _BLOCK):  # which stays in the cache of the processor
+    for first in range(0, len(point), _BLOCK):  # blocks stay in the cache of the processor
         some = slice(first, first + _BLOCK)
         root, columns = roots.take(point[some], axis=2), np.empty((3, CAMERA_DIM, len(B[some])))
         for k, column in enumerate(columns):

@@ -54,6 +54,8 @@ _PIXEL_STEPS = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
 """Pixels moved for the derivatives of bearings."""
 _LEAST_VARIANCE = 0.01
 """Of t · n, as a part of the largest one: towards an epipole distances tell nothing."""
+_POSITIVE = 1e-12
+"""Is added to it, as there are features without a bearing."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,7 +96,7 @@ class _Turned:
     Attributes:
         one, two: (P, 3, N) bearings f₁ and R f₂.
         by_one, by_two: (P, 2, 3, N) their derivatives by the pixels.
-        least: (P, N) variance of t · n that is assumed at least.
+        least: (P, N) variance of t · n that is assumed at least, for pixels with unit noise.
     """
 
     one: FloatArray
@@ -151,7 +153,7 @@ class RotationProblem:
             pixels[1, p, : len(pair.first)] = pair.second
             self._there[p, : len(pair.first)] = True
         both = np.broadcast_to(self._there, pixels.shape[:3])
-        self._pixels = np.vstack([centre, pixels[both]])  # each once; the first one fills up
+        self._pixels = np.vstack([centre, pixels[both]])  # the first: padding
         self._place = np.zeros(both.shape, int)
         self._place[both] = np.arange(1, len(self._pixels))
         self._t = np.array([[pair.first_s for pair in pairs], [pair.second_s for pair in pairs]])
@@ -178,7 +180,8 @@ class RotationProblem:
             x, y = np.moveaxis(points.reshape(moved.shape), -1, 0)
             rays = np.stack([x, y, np.ones_like(x)], axis=1) / np.sqrt(x**2 + y**2 + 1.0)[:, None]
             slopes = rays[1:] - rays[0]
-            least = _LEAST_VARIANCE * np.sum(slopes**2, axis=(0, 1))[self._place] + 5e-13
+            squares = np.sum(slopes**2, axis=(0, 1))  # of each of the two frames
+            least = _LEAST_VARIANCE * squares[self._place] + 0.5 * _POSITIVE
             known = np.all(visible.reshape(x.shape), axis=0)[self._place]
             if len(self._bearings) > 4:
                 self._bearings.clear()

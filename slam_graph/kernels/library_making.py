@@ -16,7 +16,7 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from importlib.util import find_spec
 from pathlib import Path
-from tempfile import TemporaryFile
+from tempfile import TemporaryDirectory, TemporaryFile
 
 from slam_graph.interrupts import Interrupts
 from slam_graph.kernels.library_files import kernel_modules
@@ -53,11 +53,18 @@ def make(paths: list[Path]) -> None:
         if _is_recent(failed, _RETRY_S) or all(path.is_file() for path in paths):
             return
         logger.warning("compiling kernels: once on this machine, up to a minute")
-        commands = [
-            command_of(_LINKING, str(part), str(path), str(queue))
-            for part, path in enumerate(paths)
-        ]
-        errors = _run([command for command in commands if command is not None], queue)
+        for path in paths:  # one that an interrupted process has left has other kernels
+            path.unlink(missing_ok=True)
+        with TemporaryDirectory(dir=paths[0].parent, prefix="kernels-") as folder:
+            made = [Path(folder) / path.name for path in paths]
+            commands = [
+                command_of(_LINKING, str(part), str(path), str(queue))
+                for part, path in enumerate(made)
+            ]
+            errors = _run([command for command in commands if command is not None], queue)
+            if all(path.is_file() for path in made):
+                for new, path in zip(made, paths, strict=True):
+                    os.replace(new, path)
         if errors:
             failed.write_text(errors, encoding="utf-8")
             logger.warning("kernels cannot be linked (%s); Numba compiles them", failed)
@@ -68,7 +75,7 @@ def make(paths: list[Path]) -> None:
 def _queue() -> Iterator[int]:
     """A pipe from which processes take the modules of kernels, by their numbers of one byte.
 
-    What a kernel takes to compile is seen only then.
+    How long a kernel takes to compile is not known before.
     """
     taken, given = os.pipe()
     os.write(given, bytes(range(len(kernel_modules()))))
@@ -80,7 +87,7 @@ def _queue() -> Iterator[int]:
 
 
 def _run(commands: list[list[str]], *inherited: int) -> str:
-    """Run commands at the same time; what those that failed have said.
+    """Run commands at the same time until one of them fails; what it has said.
 
     They end with this process. Ctrl-C is for this one alone, also within a block that defers it.
 
@@ -107,12 +114,14 @@ def _run(commands: list[list[str]], *inherited: int) -> str:
             )
             stack.callback(_end, process)
             started.append((process, said))
-        while any(process.poll() is None for process, _ in started):
+        while (codes := [process.poll() for process, _ in started]).count(None):
+            if any(codes):
+                break
             Interrupts.check_deferred()
             time.sleep(_POLL_S)
         errors = b""
         for process, said in started:
-            if process.returncode > 0:  # one that was killed may succeed the next time
+            if (process.returncode or 0) > 0:  # one that was killed may succeed the next time
                 said.seek(0)
                 errors += said.read()
     return errors.decode(errors="replace")

@@ -4,10 +4,10 @@
 
 Numba compiles each function that a kernel calls as if it were to run by itself: it optimises it,
 makes machine code of it and entries for callers from C. Of all that a library needs the unoptimised
-code only, which is linked to the kernels that call it and optimised with them. A kernel that others
-call is compiled for itself once more. This takes a third of the time.
+code only, which is linked to the kernels that call it and optimised with them. Numba also compiles
+a kernel once more to export it. Without all that, libraries are made in two thirds of the time.
 
-All this rests on what Numba keeps to itself. Where it has changed, making libraries fails, and
+This rests on what Numba 0.68 keeps to itself. Where a name is missing, making libraries fails, and
 Numba compiles the kernels in the process.
 """
 
@@ -30,15 +30,21 @@ def shorten_compilation(processor: str) -> dict[Callable[..., object], Any]:
         Where compiled kernels must be entered by their functions before they are exported.
     """
     context: Any = import_module("numba.core.registry").cpu_target.target_context
-    context._internal_codegen = _codegen("callees", processor)
+    _replace(context, "_internal_codegen", _codegen("callees", processor))
     lowering: Any = import_module("numba.core.lowering")
-    lowering.BaseLower.create_cfunc_wrapper = lambda lower: None
+    _replace(lowering.BaseLower, "create_cfunc_wrapper", lambda lower: None)
     _keep_types_of_calls(import_module("numba.core.types.functions").BaseFunction)
     _find_variables_faster(import_module("numba.core.ir"))
     kernels: dict[Callable[..., object], Any] = {}
     exporter: Any = import_module("numba.pycc").compiler
-    exporter.compile_extra = _exporting(kernels)
+    _replace(exporter, "compile_extra", _exporting(kernels))
     return kernels
+
+
+def _replace(owner: Any, name: str, value: object) -> None:
+    """Replace an attribute that must be there: a new one would have no effect."""
+    getattr(owner, name)
+    setattr(owner, name, value)
 
 
 def _codegen(name: str, processor: str) -> Any:

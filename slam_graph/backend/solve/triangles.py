@@ -66,7 +66,10 @@ def upper_part(values: FloatArray) -> FloatArray:
 
 
 def lower_part(values: FloatArray) -> FloatArray:
-    """A copy of a square matrix, column by column in memory, with zeros above the diagonal."""
+    """A copy of a square matrix with zeros above the diagonal.
+
+    It is column by column in memory as LAPACK's results are, which is what it is for.
+    """
     n = len(values)
     return (values.view(np.int64) & _lower_bits(_rounded(n))[:n, :n]).view(np.float64)
 
