@@ -52,10 +52,9 @@ _LEAST_PX = 0.05
 """No noise is smaller than this."""
 _PIXEL_STEPS = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
 """Pixels moved for the derivatives of bearings."""
-_LEAST_VARIANCE = 0.01
-"""Of t · n, as a part of the largest one: towards an epipole distances tell nothing."""
-_POSITIVE = 1e-12
-"""Is added to it, as there are features without a bearing."""
+_LEAST_VARIANCE, _POSITIVE = 0.01, 1e-12
+"""Of t · n, as a part of the largest one: towards an epipole distances tell nothing. And what is
+added to it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -180,15 +179,14 @@ class RotationProblem:
             x, y = np.moveaxis(points.reshape(moved.shape), -1, 0)
             rays = np.stack([x, y, np.ones_like(x)], axis=1) / np.sqrt(x**2 + y**2 + 1.0)[:, None]
             slopes = rays[1:] - rays[0]
-            squares = np.sum(slopes**2, axis=(0, 1))  # of each of the two frames
-            least = _LEAST_VARIANCE * squares[self._place] + 0.5 * _POSITIVE
+            squares = np.sum(slopes**2, axis=(0, 1))[self._place].sum(axis=0)
             known = np.all(visible.reshape(x.shape), axis=0)[self._place]
             if len(self._bearings) > 4:
                 self._bearings.clear()
             self._bearings[focal] = (
                 np.moveaxis(rays[0][:, self._place], 0, 2),
                 np.moveaxis(slopes[:, :, self._place], (0, 1), (2, 3)),
-                least.sum(axis=0),
+                _LEAST_VARIANCE * squares + _POSITIVE,
                 self._there & known.all(axis=0),
             )
         return self._bearings[focal]
