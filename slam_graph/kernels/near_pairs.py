@@ -4,6 +4,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
@@ -25,7 +27,7 @@ _Pixels = NDArray[np.float32]
 
 @compiled("i8[:, ::1](f8[:, ::1], f8[:, ::1], f8)")
 def near_pairs(first: FloatArray, second: FloatArray, distance: float) -> IntArray:
-    """Which points are at most so far apart, by comparing all with all.
+    """Which points are at most so far apart; none that is not finite.
 
     Args:
         first: (N, 2).
@@ -35,16 +37,64 @@ def near_pairs(first: FloatArray, second: FloatArray, distance: float) -> IntArr
     Returns:
         (P, 2) rows of both, ascending.
     """
-    pairs = np.empty((len(first) * len(second), 2), np.int64)
-    count, limit = 0, distance * distance
+    starts, order, left, width = _strips(second, distance)
+    strips = len(starts) - 1
+    pairs, count, limit = np.empty((4 * len(first) + 16, 2), np.int64), 0, distance * distance
     for i in range(len(first)):
         x, y = first[i]
-        for j in range(len(second)):
-            dx, dy = second[j, 0] - x, second[j, 1] - y
-            if dx * dx + dy * dy <= limit:
-                pairs[count, 0], pairs[count, 1] = i, j
+        if not math.isfinite(x):
+            continue
+        own, begin = math.floor(min(max((x - left) / width, -2.0), strips + 2.0)), count
+        for s in range(max(own - 1, 0), min(own + 2, strips)):
+            for k in range(starts[s], starts[s + 1]):
+                j = order[k]
+                dx, dy = second[j, 0] - x, second[j, 1] - y
+                if not dx * dx + dy * dy <= limit:
+                    continue
+                if count == len(pairs):
+                    longer = np.empty((2 * count, 2), np.int64)
+                    longer[:count] = pairs
+                    pairs = longer
+                place = count
+                while place > begin and pairs[place - 1, 1] > j:
+                    pairs[place, 1] = pairs[place - 1, 1]
+                    place -= 1
+                pairs[count, 0], pairs[place, 1] = i, j
                 count += 1
     return pairs[:count].copy()
+
+
+@compiled()
+def _strips(points: FloatArray, distance: float) -> tuple[IntArray, IntArray, float, float]:
+    """Vertical strips of the plane, at least `distance` wide, as many as there are points at most.
+
+    Returns:
+        starts: (S + 1,) of each strip in `order`.
+        order: (N,) rows of the points, strip by strip, ascending in each.
+        left: edge of the first strip.
+        width: of a strip.
+    """
+    left, right = math.inf, -math.inf
+    for point in points:
+        if math.isfinite(point[0]):
+            left, right = min(left, point[0]), max(right, point[0])
+    if not left <= right:
+        left, right = 0.0, 0.0
+    width = max(distance, (right - left) / len(points), 1e-300) if len(points) else 1.0
+    strip = np.full(len(points), -1)
+    starts = np.zeros(math.floor((right - left) / width) + 2, np.int64)
+    for j in range(len(points)):
+        if math.isfinite(points[j, 0]):
+            strip[j] = math.floor((points[j, 0] - left) / width)
+            starts[strip[j] + 1] += 1
+    for s in range(1, len(starts)):
+        starts[s] += starts[s - 1]
+    free, order = starts.copy(), np.empty(len(points), np.int64)
+    for j in range(len(points)):
+        if strip[j] >= 0:
+            order[free[strip[j]]] = j
+            free[strip[j]] += 1
+    return starts, order, left, width
 
 
 def near_pairs_numpy(first: FloatArray, second: FloatArray, distance: float) -> IntArray:

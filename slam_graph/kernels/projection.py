@@ -12,7 +12,7 @@ import math
 
 import numpy as np
 
-from slam_graph.arrays import FloatArray, IntArray
+from slam_graph.arrays import BoolArray, FloatArray, IntArray
 from slam_graph.kernels.compilation import compiled
 
 __all__ = [
@@ -20,9 +20,73 @@ __all__ = [
     "chain_rule_numpy",
     "distort_equidistant",
     "distort_radtan",
+    "points_ahead",
+    "points_ahead_numpy",
     "to_cameras",
     "to_cameras_numpy",
 ]
+
+
+@compiled("i8(f8[:, :], b1[:], f8[:, :], f8[:], f8, f8, i8[::1], f8[:, ::1])")
+def points_ahead(
+    points: FloatArray,
+    used: BoolArray,
+    world_R_camera: FloatArray,
+    centre: FloatArray,
+    nearest: float,
+    square: float,
+    rows: IntArray,
+    normalized: FloatArray,
+) -> int:
+    """Points that a camera may see, on the plane z = 1 in front of it.
+
+    Args:
+        points: (J, 3) in the world.
+        used: (J,) which of them to look at.
+        world_R_camera: (3, 3).
+        centre: (3,) of the camera in the world.
+        nearest: least depth, m.
+        square: squared length of the longest normalised point that is seen.
+        rows: (J,), filled from the beginning with the rows of these points.
+        normalized: (J, 2), filled likewise.
+
+    Returns:
+        How many there are.
+    """
+    R, count = world_R_camera, 0
+    for j in range(len(points)):
+        if not used[j]:
+            continue
+        x, y, z = points[j, 0] - centre[0], points[j, 1] - centre[1], points[j, 2] - centre[2]
+        depth = x * R[0, 2] + y * R[1, 2] + z * R[2, 2]
+        if not depth > nearest:
+            continue
+        u = (x * R[0, 0] + y * R[1, 0] + z * R[2, 0]) / depth
+        v = (x * R[0, 1] + y * R[1, 1] + z * R[2, 1]) / depth
+        if u * u + v * v < square:
+            rows[count], normalized[count, 0], normalized[count, 1] = j, u, v
+            count += 1
+    return count
+
+
+def points_ahead_numpy(
+    points: FloatArray,
+    used: BoolArray,
+    world_R_camera: FloatArray,
+    centre: FloatArray,
+    nearest: float,
+    square: float,
+    rows: IntArray,
+    normalized: FloatArray,
+) -> int:
+    """`points_ahead` in NumPy."""
+    in_camera = (points - centre) @ world_R_camera
+    ahead = np.flatnonzero(used & (in_camera[:, 2] > nearest))
+    found = in_camera[ahead, :2] / in_camera[ahead, 2:]
+    inside = np.sum(found**2, axis=1) < square
+    count = np.count_nonzero(inside)
+    rows[:count], normalized[:count] = ahead[inside], found[inside]
+    return count
 
 
 @compiled(

@@ -28,7 +28,9 @@ from slam_graph.arrays import BoolArray, FloatArray, IntArray
 from slam_graph.backend.cost.feature_tracks import Observations
 from slam_graph.backend.cost.reprojection import Geometry, RigProjection
 from slam_graph.backend.cost.robust_loss import MEDIAN_1D
+from slam_graph.kernels.feature_matches import drift_consensus, mixture_probabilities
 from slam_graph.kernels.near_pairs import near_pairs
+from slam_graph.kernels.projection import points_ahead
 
 _DRIFT_SIGMAS = np.array([0.1, 0.1, 0.1, 0.02])
 """Standard deviation of the drift between visits, a weak prior: shift (m) and yaw (rad)."""
@@ -36,8 +38,6 @@ _MAX_FALSE_ALARMS = 0.01
 _SAMPLES = 100
 _REFINEMENTS = 3
 _EM_STEPS = 30
-_NO_CHANCE = 1e-300
-"""Keeps probabilities defined where both densities vanish."""
 
 
 def drift_jacobian(by_point: FloatArray, arms: FloatArray) -> FloatArray:
@@ -93,15 +93,23 @@ def _largest_set(
     J: FloatArray, offsets: FloatArray, limit: float, rng: np.random.Generator
 ) -> tuple[BoolArray, FloatArray]:
     """The largest set (P,) consistent with one drift, and what is left (P, m) of all offsets."""
-    pairs = rng.permuted(np.tile(np.arange(len(J)), (_SAMPLES, 1)), axis=1)[:, :2]
-    drifts = _least_squares(J[pairs], offsets[pairs])
-    residuals = np.linalg.norm(offsets - np.einsum("pij,sj->spi", J, drifts), axis=2)
-    consistent = residuals[np.argmax(np.sum(residuals < limit, axis=1))] < limit
-    for _ in range(_REFINEMENTS):
-        drift = _least_squares(J[None, consistent], offsets[None, consistent])[0]
-        refined = offsets - J @ drift
-        consistent = np.linalg.norm(refined, axis=1) < limit
-    return consistent, refined
+    residuals = np.empty(offsets.shape)
+    consistent = drift_consensus(
+        np.ascontiguousarray(J),
+        np.ascontiguousarray(offsets),
+        _pairs(len(J), rng),
+        _DRIFT_SIGMAS**-2.0,
+        limit,
+        _REFINEMENTS,
+        residuals,
+    )
+    return consistent, residuals
+
+
+def _pairs(count: int, rng: np.random.Generator) -> IntArray:
+    """(S, 2) random pairs of two out of `count` matches."""
+    first = rng.integers(count, size=_SAMPLES)
+    return np.stack([first, (first + rng.integers(1, count, _SAMPLES)) % count], axis=1)
 
 
 def match_probabilities(residuals: FloatArray, chances: FloatArray) -> FloatArray:
@@ -119,23 +127,12 @@ def match_probabilities(residuals: FloatArray, chances: FloatArray) -> FloatArra
     """
     squares = np.sum(residuals[:, :2] ** 2, axis=1)
     depths = np.abs(residuals[:, 2]) if residuals.shape[1] > 2 else np.zeros(len(residuals))
-    true = np.exp(-0.5 * (squares + depths**2)) / (2.0 * math.pi)
-    probabilities = np.full(len(residuals), 0.5)
-    for _ in range(_EM_STEPS if len(residuals) else 0):
-        others = depths[probabilities <= 0.5]
-        scatter = max(float(np.median(others)) / MEDIAN_1D, 1.0) if len(others) else 1.0
-        false = chances / math.pi * np.exp(-0.5 * (depths / scatter) ** 2) / scatter
-        share = np.mean(probabilities)
-        probabilities = share * true / (share * true + (1.0 - share) * false + _NO_CHANCE)
+    order = np.argsort(depths, kind="stable")
+    probabilities = np.empty(len(residuals))
+    probabilities[order] = mixture_probabilities(
+        squares[order], depths[order], chances[order], MEDIAN_1D, _EM_STEPS
+    )
     return probabilities
-
-
-def _least_squares(J: FloatArray, offsets: FloatArray) -> FloatArray:
-    """Least-squares drifts (S, 4) of sets of matches with J (S, P, m, 4) and offsets (S, P, m)."""
-    J, offsets = J.reshape(len(J), -1, 4), offsets.reshape(len(J), -1, 1)
-    transposed = J.transpose(0, 2, 1)
-    normal = transposed @ J + np.diag(_DRIFT_SIGMAS**-2.0)
-    return np.asarray(np.linalg.solve(normal, transposed @ offsets)[:, :, 0])
 
 
 REACH_PX = 8.0
@@ -234,14 +231,15 @@ def _around(
     frame, camera = seen.frame[rows[0]], seen.camera[rows[0]]
     world_R_camera = at.rotations[frame] @ projection.body_R_camera[camera]
     centre = at.positions[frame] + at.rotations[frame] @ projection.body_p_camera[camera]
-    points = (at.points - centre) @ world_R_camera
-    ahead = scene.usable & (points[:, 2] > _MIN_DEPTH_M)
-    ahead[seen.feature[rows]] = False
-    others = np.flatnonzero(ahead)
-    normalized = points[others, :2] / points[others, 2:]
+    used = scene.usable.copy()
+    used[seen.feature[rows]] = False
     # a distortion model is valid as far from the axis as features are seen
-    inside = np.sum(normalized**2, axis=1) < np.max(np.sum(seen.normalized[rows] ** 2, axis=1))
-    others, pixels = others[inside], projection.cameras[camera].distort(normalized[inside])[0]
+    square = float(np.max(np.sum(seen.normalized[rows] ** 2, axis=1)))
+    others, normalized = np.empty(len(used), np.int64), np.empty((len(used), 2))
+    count = points_ahead(
+        at.points, used, world_R_camera, centre, _MIN_DEPTH_M, square, others, normalized
+    )
+    pixels = projection.cameras[camera].pixels(normalized[:count])
     rows = rows[scene.usable[seen.feature[rows]]]
     near, hit = near_pairs(seen.pixels[rows], pixels, around_px).T
     rows = rows[near]
