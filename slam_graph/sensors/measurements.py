@@ -98,8 +98,7 @@ class ImuData:
         pim = gtsam.PreintegratedCombinedMeasurements(params, bias)
         durations_s, gyro, accel = self.steps()
         if durations_s.max() > _LONGEST_STEP_S:
-            pieces = np.ceil(durations_s / _LONGEST_STEP_S - 1e-6)
-            pieces = np.clip(pieces, 1, _MOST_STEPS).astype(int)
+            pieces = self.pieces()
             durations_s, gyro, accel = (
                 np.repeat(values, pieces, axis=0) for values in (durations_s / pieces, gyro, accel)
             )
@@ -116,6 +115,11 @@ class ImuData:
         gyro = 0.5 * (self.gyro[1:] + self.gyro[:-1])
         accel = 0.5 * (self.accel[1:] + self.accel[:-1])
         return self._durations_s(), gyro, accel
+
+    def pieces(self) -> IntArray:
+        """In how many steps each time (N - 1,) between samples is integrated."""
+        pieces = np.ceil(self._durations_s() / _LONGEST_STEP_S - 1e-6)
+        return np.clip(pieces, 1, _MOST_STEPS).astype(np.int64)
 
     def _durations_s(self) -> FloatArray:
         """Durations (N - 1,) in s between samples."""

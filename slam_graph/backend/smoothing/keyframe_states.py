@@ -12,8 +12,9 @@ import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import B, V, X
 
-from slam_graph.arrays import IntArray
+from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.geometry import NavState, Trajectory, interpolate
+from slam_graph.kernels.imu_prediction import predict_motion
 from slam_graph.sensors import ImuBuffer
 
 _MAX_GAP_S = 1.0
@@ -147,24 +148,68 @@ def fill_in(
         imu: samples over all of these times.
         params: gravity and noise.
     """
+    known_ns = [state.stamp_ns for state in keyframes]
+    at = np.searchsorted(stamps_ns, known_ns)
+    if len(stamps_ns) == len(keyframes):
+        return list(keyframes)
+    rotations, positions, velocities = _predicted(keyframes, stamps_ns, at, imu, params)
     states: list[NavState] = []
-    at = np.searchsorted(stamps_ns, [state.stamp_ns for state in keyframes])
     for k, (start, end) in enumerate(pairwise(keyframes)):
         states.append(start)
-        inside = stamps_ns[at[k] + 1 : at[k + 1]].tolist()
-        if not inside:
+        if at[k] + 1 == at[k + 1]:
             continue
-        predicted = [start]
-        for stamp_ns in [*inside, end.stamp_ns]:
-            predicted.append(_predict_forward(predicted[-1], stamp_ns, imu, params))
-        pose_error = gtsam.Pose3.Logmap(predicted[-1].world_T_body.between(end.world_T_body))
-        velocity_error = end.velocity - predicted[-1].velocity
-        for state in predicted[1:-1]:
-            part = (state.stamp_ns - start.stamp_ns) / (end.stamp_ns - start.stamp_ns)
-            pose = state.world_T_body.compose(gtsam.Pose3.Expmap(part * pose_error))
-            velocity = state.velocity + part * velocity_error
-            states.append(replace(state, world_T_body=pose, velocity=velocity))
+        there = _pose(rotations[at[k + 1]], positions[at[k + 1]])
+        pose_error = gtsam.Pose3.Logmap(there.between(end.world_T_body))
+        velocity_error = end.velocity - velocities[at[k + 1]]
+        biases = {"accel_bias": start.accel_bias, "gyro_bias": start.gyro_bias}
+        for i in range(at[k] + 1, at[k + 1]):
+            part = (stamps_ns[i] - known_ns[k]) / (known_ns[k + 1] - known_ns[k])
+            pose = _pose(rotations[i], positions[i])
+            pose = pose.compose(gtsam.Pose3.Expmap(part * pose_error))
+            velocity = velocities[i] + part * velocity_error
+            states.append(NavState(int(stamps_ns[i]), pose, velocity, **biases))
     return [*states, keyframes[-1]]
+
+
+def _predicted(
+    keyframes: list[NavState],
+    stamps_ns: IntArray,
+    at: IntArray,
+    imu: ImuBuffer,
+    params: gtsam.PreintegrationCombinedParams,
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Rotations (N, 3, 3), positions and velocities (N, 3), each predicted from the keyframe before.
+
+    Args:
+        keyframes: their states.
+        stamps_ns: (N,) times.
+        at: (K,) rows of the keyframes in these.
+        imu: as for `fill_in`.
+        params: as for `fill_in`.
+    """
+    durations, rates, forces, steps = imu.steps_at(stamps_ns)
+    rotations, (positions, velocities) = np.empty((len(stamps_ns), 3, 3)), np.empty((2, len(stamps_ns), 3))
+    poses = np.array([state.world_T_body.matrix() for state in keyframes])
+    rotations[at], positions[at] = poses[:, :3, :3], poses[:, :3, 3]
+    velocities[at] = [state.velocity for state in keyframes]
+    predict_motion(
+        durations,
+        rates,
+        forces,
+        steps,
+        at,
+        rotations,
+        positions,
+        velocities,
+        np.array([state.gyro_bias for state in keyframes]),
+        np.array([state.accel_bias for state in keyframes]),
+        np.array(params.n_gravity, np.float64),
+    )
+    return rotations, positions, velocities
+
+
+def _pose(rotation: FloatArray, position: FloatArray) -> gtsam.Pose3:
+    return gtsam.Pose3(gtsam.Rot3(rotation), position)
 
 
 def fill_in_by_motion(

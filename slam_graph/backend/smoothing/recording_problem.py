@@ -147,7 +147,7 @@ class BundleAdjustment:
             pixel_sigma=self._sigma_px,
             inefficiency=self._inefficiency,
         )
-        states, aligned, equations = self._states(self._segment.stamps_ns), None, None
+        aligned, equations = None, None
         try:
             equations = self._equations()
             covariances, self._values = equations.covariances(), equations.minimum.values
@@ -155,7 +155,7 @@ class BundleAdjustment:
             states, aligned = with_covariances(states, covariances, equations.frames)
         except (RuntimeError, np.linalg.LinAlgError) as error:
             logger.info("no covariances: %s", " ".join(str(error).split())[:200])
-            equations = None
+            states, equations = self._states(self._segment.stamps_ns), None
         figures = replace(figures, iterations=self.iterations)
         kept = equations if self._task.joint else None
         fixes = None if equations is None else equations.minimum.fixes

@@ -22,6 +22,7 @@ covariances; roots keep them.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import gtsam
 import numpy as np
@@ -56,19 +57,22 @@ class ChainEquations:
         """Those of a linear graph over X(k), V(k) and B(k) of the keyframes 0 to K-1."""
         information = np.zeros((keyframes - 1, 2 * STATE, 2 * STATE))
         gradient = np.zeros((keyframes, STATE))
-        for i in range(linear.size()):
-            factor = linear.at(i)
-            keys = list(factor.keys())
-            frames = [gtsam.symbolIndex(key) for key in keys]
-            first = min(*frames, keyframes - 2)
-            parts = [_PARTS[chr(gtsam.symbolChr(key))] for key in keys]
-            columns = np.concatenate(
-                [STATE * (k - first) + part for k, part in zip(frames, parts, strict=True)]
-            )
+        for factor in map(linear.at, range(linear.size())):
+            keys = factor.keys()
+            first = min(*map(gtsam.symbolIndex, keys), keyframes - 2)
+            columns, square = _columns(tuple(key - first for key in keys))
             augmented = factor.augmentedInformation()
-            information[first][np.ix_(columns, columns)] += augmented[:-1, :-1]
+            information[first][square] += augmented[:-1, :-1]
             gradient[first : first + 2].reshape(-1)[columns] += augmented[:-1, -1]
         return cls(information, gradient)
+
+
+@lru_cache
+def _columns(keys: tuple[int, ...]) -> tuple[IntArray, tuple[IntArray, ...]]:
+    """Columns of some variables of two states, and those of their square; by keys of 0 and 1."""
+    parts = [STATE * gtsam.symbolIndex(k) + _PARTS[chr(gtsam.symbolChr(k))] for k in keys]
+    columns = np.concatenate(parts)
+    return columns, np.ix_(columns, columns)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

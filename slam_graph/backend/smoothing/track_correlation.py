@@ -76,8 +76,10 @@ def _sums(
     together = camera[:, None] == camera
     apart = np.abs(frame[:, None] - frame)
     L = np.kron(np.where(together & (apart == 1), 0.5, 0.0), np.eye(2))
-    correlations = np.where(together[..., None], _CORRELATIONS ** apart[..., None], 0.0)
-    expected = [
-        np.einsum("ij,ijc->c", M[0::2, 0::2] + M[1::2, 1::2], correlations) for M in (P, P @ L @ P)
-    ]
+    powers = _CORRELATIONS ** np.arange(apart.max() + 1)[:, None]
+    expected = []
+    for M in (P, P @ L @ P):
+        products = M[0::2, 0::2] + M[1::2, 1::2]
+        sums = np.bincount(apart[together], products[together], len(powers))
+        expected.append(sums @ powers)
     return np.column_stack([[e @ e, e @ L @ e], expected])
