@@ -142,7 +142,7 @@ class StandstillDetector:
         if sigma is not None:
             self._noises_px.append((self._recent[-1][0], sigma))
         noises_px = [px for _, px in self._noises_px]
-        self.noise_px = float(np.median(noises_px)) if noises_px else 0.0
+        self.noise_px = float(median(np.array(noises_px))) if noises_px else 0.0
 
     def _noise_of_last_frames(self) -> float | None:
         """The noise by the second differences of the last three frames, with enough features.

@@ -18,20 +18,20 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.backend.depth_camera import with_depth_camera, with_depth_observed
 from slam_graph.backend.dynamics import motionless_samples
 from slam_graph.backend.initialization.clock_change import ClockChanges
 from slam_graph.backend.smoothing.smoothing_config import FinalBaConfig
-from slam_graph.datasets import RecordedSequence, TrackRecorder, open_dataset
+from slam_graph.datasets import ReaderOptions, TrackRecorder, TrackRecordingSequence
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.sensors import (
     AidingData,
     FeatureFrame,
     FeatureObservations,
     ImuData,
-    Packet,
     Rig,
 )
 
@@ -41,6 +41,8 @@ _SPACING_WITHOUT_IMU_S = 0.05
 """Longest time between keyframes without an IMU, which else tells the motion between them."""
 _AROUND_NS = 200_000_000
 """Samples so much earlier are read where the clock of the IMU has become earlier."""
+_HISTORY_NS = 1_000_000_000
+"""Samples so much before the first frame are read."""
 _JITTER = 0.95
 """Part of the keyframe spacing that is enough, because time stamps jitter."""
 
@@ -186,30 +188,32 @@ class FrameLog:
         """(N, 2) factors on the noise of gyroscope and accelerometer at the frames."""
         return np.array(self._noise, dtype=np.float64).reshape(-1, 2)
 
-    def packets(self, first: int, stop: int, rig: Rig) -> Iterator[Packet]:
-        """Frames `first` to `stop - 1`, each with the samples since the one before."""
-        clocks, sequence, begin_ns = self.clock_changes, self._recorded, self._frames[first]
-        # it says how far samples lead; those of a clock that became earlier are of frames before
-        sequence.rig = replace(rig.shifted(clocks.latest_s), has_imu=True)
-        earlier_ns = begin_ns
+    def samples(self, first: int, stop: int, rig: Rig) -> ImuData:
+        """The samples of the IMU around the frames `first` to `stop - 1`, and 1 s before them."""
+        clocks = self.clock_changes
+        # samples of a clock that became later are of frames before, of one that became earlier
+        # of frames behind
+        begin_ns = self._frames[first] - _HISTORY_NS
         if clocks.earliest_s < 0.0:
-            earlier_ns += round(clocks.earliest_s * 1e9) - _AROUND_NS
-        before: list[ImuData] = []
-        newest_ns = np.iinfo(np.int64).min
-        for packet in sequence.packets(earlier_ns, self._frames[stop - 1]):
-            before.append(packet.imu)
-            if packet.frame.stamp_ns < begin_ns:
-                continue
-            imu = clocks.corrected(ImuData.concatenate(before))
-            imu = imu[int(np.searchsorted(imu.stamps_ns, newest_ns, side="right")) :]
-            newest_ns = int(imu.stamps_ns[-1]) if len(imu) else newest_ns
-            yield replace(packet, imu=imu)
-            before = []
+            begin_ns += round(clocks.earliest_s * 1e9) - _AROUND_NS
+        ahead_s = replace(rig.shifted(clocks.latest_s), has_imu=True).end_offset_s
+        end_ns = self._frames[stop - 1] + max(0, round(ahead_s * 1e9))
+        blocks: list[ImuData] = []
+        for block in self._recorded.imu_blocks(begin_ns):
+            beyond = int(np.searchsorted(block.stamps_ns, end_ns)) + 1
+            blocks.append(block[:beyond])
+            if beyond <= len(block):
+                break
+        return clocks.corrected(ImuData.concatenate(blocks))
+
+    def features(self, first: int, stop: int) -> tuple[IntArray, NDArray[np.void]]:
+        """Features of the frames `first` to `stop - 1`, as `TrackRecordingSequence.features`."""
+        return self._recorded.features(self._frames[first], self._frames[stop - 1])
 
     @cached_property
-    def _recorded(self) -> RecordedSequence:
+    def _recorded(self) -> TrackRecordingSequence:
         """All frames as they were recorded: opened once for each part."""
-        return open_dataset(self._path, "recording", diagnostics=_Silent())
+        return TrackRecordingSequence(self._path, ReaderOptions(diagnostics=_Silent()))
 
     def _follows(self, frame_ns: int) -> bool:
         """Whether a frame is later than the others and within the IMU samples."""

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from slam_graph.arrays import BoolArray, FloatArray, IntArray
 from slam_graph.backend.backend_config import BackendConfig, ZeroVelocityConfig
@@ -20,15 +21,19 @@ from slam_graph.backend.smoothing.frame_log import FrameLog
 from slam_graph.backend.smoothing.keyframe_aiding import KeyframeAiding
 from slam_graph.backend.solve.state import FrameMotion
 from slam_graph.geometry import NavState
-from slam_graph.sensors import FeatureFrame, ImuBuffer, ImuData, Rig, RigCamera
+from slam_graph.sensors import (
+    FeatureFrame,
+    FeatureObservations,
+    ImuBuffer,
+    Rig,
+    RigCamera,
+)
 
 _MAX_INITIAL_ERROR = 30.0
 """Features with a larger root-mean-square reprojection error are left out, in units of σ."""
 _PINHOLE_TANGENT = 2.75
 """Longest normalised points that a pinhole in place of a wide lens sees: 70° off the axis. In its
 pixels the noise grows with 1 / cos², by 9 there. Those further out are left out."""
-_RECENT_NS = 10_000_000_000
-"""Length of the IMU buffer in which a standstill is detected."""
 
 
 def row_motions(states: Sequence[NavState], imu: ImuBuffer, rig: Rig) -> dict[int, FrameMotion]:
@@ -94,35 +99,48 @@ def read_segment(
         standstill: settings of the standstill detector.
     """
     first, stop = int(keyframes[0]), int(keyframes[-1]) + 1
-    offset_ns = round(rig.pose_offset_s * 1e9)
-    detector, recent = StandstillDetector(standstill), ImuBuffer()
-    samples, stamps, sigmas = [], [], []
-    columns: list[tuple[IntArray, ...]] = []
-    points: list[FloatArray] = []
-    for number, packet in enumerate(log.packets(first, stop, rig)):
-        frame = packet.frame
-        assert isinstance(frame, FeatureFrame)
-        samples.append(packet.imu)
-        recent.add(packet.imu)
-        stamps.append(frame.stamp_ns + offset_ns)
-        sigma = detector.add_frame(recent, stamps[-1], frame)
-        sigmas.append(np.nan if sigma is None else sigma)
-        recent.forget_before(stamps[-1] - _RECENT_NS)
-        for c, seen in enumerate(frame.cameras):
-            columns.append((seen.ids, np.full(len(seen), number), np.full(len(seen), c)))
-            points.append(np.hstack([seen.pixels, seen.normalized]))
     imu = ImuBuffer()
-    imu.add(ImuData.concatenate(samples))
-    ids, frames, cameras = (np.concatenate(column) for column in zip(*columns, strict=True))
-    places = np.concatenate(points)
+    imu.add(log.samples(first, stop, rig))
+    stamps_ns = log.frames_ns[first:stop] + round(rig.pose_offset_s * 1e9)
+    counts, rows = log.features(first, stop)
+    sigmas = _still_sigmas(StandstillDetector(standstill), imu, stamps_ns, counts, rows)
+    image = np.repeat(np.arange(counts.size), counts.ravel())
+    frames, cameras = np.divmod(image, counts.shape[1])
+    points = _recalibrated(np.hstack([rows["pixel"], rows["normalized"]]), cameras, log, rig)
     return RecordingSegment(
-        np.array(stamps),
+        stamps_ns,
         keyframes - first,
         _smoothed_noise(log.noise[first:stop], np.isfinite(sigmas)),
-        np.array(sigmas),
+        sigmas,
         imu,
-        _table(ids, frames, cameras, _recalibrated(places, cameras, log, rig), len(stamps)),
+        _table(rows["id"], frames, cameras, points, len(stamps_ns)),
     )
+
+
+def _still_sigmas(
+    detector: StandstillDetector,
+    imu: ImuBuffer,
+    stamps_ns: IntArray,
+    counts: IntArray,
+    rows: NDArray[np.void],
+) -> FloatArray:
+    """Standard deviations (N,) of the velocity of frames from zero, m/s; NaN where they move.
+
+    Args:
+        detector: sees the frames.
+        imu: samples over all of these times.
+        stamps_ns: (N,) of the frames.
+        counts: see `FrameLog.features`.
+        rows: see `FrameLog.features`.
+    """
+    ends, sigmas = np.cumsum(counts.sum(axis=1)), np.full(len(stamps_ns), np.nan)
+    for k, begin in enumerate(ends - counts.sum(axis=1)):
+        own = rows[begin : begin + counts[k, 0]]
+        seen = FeatureObservations(own["id"], own["pixel"], own["normalized"])
+        stamp_ns = int(stamps_ns[k])
+        sigma = detector.add_frame(imu, stamp_ns, FeatureFrame(stamp_ns, (seen,)))
+        sigmas[k] = np.nan if sigma is None else sigma
+    return sigmas
 
 
 def _smoothed_noise(noise: FloatArray, still: BoolArray) -> FloatArray:

@@ -41,6 +41,7 @@ from typing import BinaryIO, ClassVar, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from slam_graph.arrays import IntArray
 from slam_graph.datasets.calibration.calibration_yaml import YamlValue, read_yaml
 from slam_graph.datasets.calibration.kalibr_calibration import read_kalibr
 from slam_graph.datasets.formats.recorded_files import AGAIN, check_length
@@ -255,6 +256,29 @@ class TrackRecordingSequence(RecordedSequence):
                     self._seen_by_lenses(observed),
                     moving=self._seen_by_lenses(moving),
                 )
+
+    def features(self, first_ns: int, last_ns: int) -> tuple[IntArray, NDArray[np.void]]:
+        """All features of some frames at once, as they were recorded.
+
+        Args:
+            first_ns: time of the first of these frames.
+            last_ns: time of the last one.
+
+        Returns:
+            The number (F, C) of features by frame and camera, and the features (N,), frame by frame
+            and camera by camera, with `id`, `pixel` and `normalized`.
+
+        Raises:
+            DataError: if one is not finite.
+        """
+        stamps, counts = self._index["stamp"], self._index["counts"]
+        first, stop = stamps.searchsorted(first_ns), stamps.searchsorted(last_ns, side="right")
+        before, count = int(counts[:first].sum()), int(counts[first:stop].sum())
+        offset = before * FEATURE_RECORD.itemsize
+        rows = np.fromfile(self.path / FEATURES, FEATURE_RECORD, count, offset=offset)
+        if not (Files.are_measurable(rows["pixel"]) & Files.are_measurable(rows["normalized"])).all():
+            raise DataError(f"{self.path / FEATURES}: a feature is not finite, or too far; {AGAIN}")
+        return counts[first:stop], rows
 
     def initial_state(self) -> NavState | None:
         """The state at the start, if one was recorded."""
