@@ -7,7 +7,7 @@ from __future__ import annotations
 import numpy as np
 
 from slam_graph.arrays import FloatArray, IntArray
-from slam_graph.sensors.measurements import ImuData
+from slam_graph.sensors.measurements import ImuData, ImuSteps
 
 _FAR_FUTURE_NS = 2**62
 
@@ -79,15 +79,14 @@ class ImuBuffer:
         gyro[-1], accel[-1] = self._at(end_ns, start_ns)
         return ImuData(stamps, gyro, accel)
 
-    def steps_at(self, stamps_ns: IntArray) -> tuple[FloatArray, FloatArray, FloatArray, IntArray]:
+    def steps_at(self, stamps_ns: IntArray) -> tuple[ImuSteps, IntArray]:
         """Steps in which the motion over some times is integrated, each within two of them.
 
         Args:
             stamps_ns: (N,) ascending, at least two.
 
         Returns:
-            Durations (S,) in s, mean rates and specific forces (S, 3), and the first step (N,)
-            after each time.
+            The steps, and the first one (N,) after each time.
         """
         samples = self.between(int(stamps_ns[0]), int(stamps_ns[-1]))
         times = np.union1d(samples.stamps_ns, stamps_ns)
@@ -97,12 +96,9 @@ class ImuBuffer:
             for values in (samples.gyro, samples.accel)
         )
         merged = ImuData(times, gyro, accel)
-        (durations_s, gyro, accel), pieces = merged.steps(), merged.pieces()
-        durations_s, gyro, accel = (
-            np.repeat(values, pieces, axis=0) for values in (durations_s / pieces, gyro, accel)
-        )
+        steps, pieces = merged.short_steps(), merged.pieces()
         first = np.concatenate([[0], np.cumsum(pieces)])
-        return durations_s, gyro, accel, first[times.searchsorted(stamps_ns)]
+        return steps, first[times.searchsorted(stamps_ns)]
 
     def _at(self, stamp_ns: int, zero_ns: int) -> tuple[FloatArray, FloatArray]:
         """Angular rate and specific force (3,) at a time, interpolated or the nearest held.

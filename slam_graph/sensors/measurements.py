@@ -27,6 +27,34 @@ _MOST_STEPS = 500
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class ImuSteps:
+    """Short times in which angular rate and specific force are taken for constant.
+
+    Attributes:
+        durations_s: (N,) in s.
+        gyro: (N, 3) angular rates, rad/s.
+        accel: (N, 3) specific forces, m/s².
+    """
+
+    durations_s: FloatArray
+    gyro: FloatArray
+    accel: FloatArray
+
+    def preintegrated(
+        self, bias: gtsam.imuBias.ConstantBias, params: gtsam.PreintegrationCombinedParams
+    ) -> gtsam.PreintegratedCombinedMeasurements:
+        """As `ImuData.preintegrated`."""
+        pim = gtsam.PreintegratedCombinedMeasurements(params, bias)
+        # GTSAM turns the specific force by the attitude at the start of a step; this is half a
+        # step on
+        half_turn = 0.5 * self.durations_s[:, None] * (self.gyro - bias.gyroscope())
+        accel = self.accel + _cross(half_turn, self.accel - bias.accelerometer())
+        for a, w, dt in zip(accel, self.gyro, self.durations_s.tolist(), strict=True):
+            pim.integrateMeasurement(a, w, dt)
+        return pim
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class ImuData:
     """A block of consecutive IMU samples, in the body frame, and their integration.
 
@@ -95,20 +123,17 @@ class ImuData:
             bias: at which the integration is linearised.
             params: noise of the IMU (`ImuNoise.preintegration_params`).
         """
-        pim = gtsam.PreintegratedCombinedMeasurements(params, bias)
+        return self.short_steps().preintegrated(bias, params)
+
+    def short_steps(self) -> ImuSteps:
+        """The steps between samples, none longer than what is integrated at once."""
         durations_s, gyro, accel = self.steps()
         if durations_s.max() > _LONGEST_STEP_S:
             pieces = self.pieces()
             durations_s, gyro, accel = (
                 np.repeat(values, pieces, axis=0) for values in (durations_s / pieces, gyro, accel)
             )
-        # GTSAM turns the specific force by the attitude at the start of a step; this is half a
-        # step on
-        half_turn = 0.5 * durations_s[:, None] * (gyro - bias.gyroscope())
-        accel = accel + _cross(half_turn, accel - bias.accelerometer())
-        for a, w, dt in zip(accel, gyro, durations_s.tolist(), strict=True):
-            pim.integrateMeasurement(a, w, dt)
-        return pim
+        return ImuSteps(durations_s, gyro, accel)
 
     def steps(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Durations (N - 1,) in s between samples, mean rates and specific forces (N - 1, 3)."""

@@ -3,8 +3,8 @@
 """Levenberg-Marquardt over a recording, with factors that serve several steps.
 
 A factor costs many times as much as a gradient and a solution by it. After a step that hardly
-changes the cost, the factor is nearly that of the new estimates, and steps by it converge, linearly
-and fast (the chord method: Kelley 1995, ch. 5).
+changes the cost, or changes it as predicted, the factor is nearly that of the new estimates, and
+steps by it converge, linearly and fast (the chord method: Kelley 1995, ch. 5).
 """
 
 from __future__ import annotations
@@ -23,6 +23,8 @@ _MAX_DAMPING = 1e5
 """Steps end when the damping exceeds this."""
 _SMALL_STEP = 0.02
 """A factor is kept after a step that lowers the cost by less than this part of it,"""
+_AGREEMENT = 0.1
+"""or by what was predicted but for this part, as it is hardly another one then;"""
 _CONTRACTION = 0.2
 """and by less than this part of what the step before did."""
 _CAUTION = 0.01
@@ -65,7 +67,8 @@ def minimized(
                 if factor is None:
                     known = None  # it is large
                     factor, damped = linear.factor(damping), damping
-                moved = estimates.moved(factor.step(linear))
+                step = factor.step(linear)
+                moved = estimates.moved(step)
                 after = cost.value(moved)
             except (np.linalg.LinAlgError, RuntimeError):
                 after = math.nan
@@ -81,7 +84,10 @@ def minimized(
         if decrease <= tolerance * value * (1.0 if fresh else _CAUTION):
             break
         damping *= 0.1 if fresh else 1.0
-        if decrease > _SMALL_STEP * value or (not fresh and decrease > _CONTRACTION * before):
+        as_predicted = abs(decrease - step.predicted) < _AGREEMENT * step.predicted
+        if decrease > _SMALL_STEP * value and not (fresh and as_predicted):
+            factor = None
+        elif not fresh and decrease > _CONTRACTION * before:
             factor = None
         before = decrease
     if not math.isfinite(value):

@@ -187,16 +187,17 @@ def _predicted(
         imu: as for `fill_in`.
         params: as for `fill_in`.
     """
-    durations, rates, forces, steps = imu.steps_at(stamps_ns)
-    rotations, (positions, velocities) = np.empty((len(stamps_ns), 3, 3)), np.empty((2, len(stamps_ns), 3))
+    steps, first = imu.steps_at(stamps_ns)
+    count = len(stamps_ns)
+    rotations, (positions, velocities) = np.empty((count, 3, 3)), np.empty((2, count, 3))
     poses = np.array([state.world_T_body.matrix() for state in keyframes])
     rotations[at], positions[at] = poses[:, :3, :3], poses[:, :3, 3]
     velocities[at] = [state.velocity for state in keyframes]
     predict_motion(
-        durations,
-        rates,
-        forces,
-        steps,
+        steps.durations_s,
+        steps.gyro,
+        steps.accel,
+        first,
         at,
         rotations,
         positions,

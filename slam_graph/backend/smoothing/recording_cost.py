@@ -60,10 +60,18 @@ class Estimates:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Step:
-    """Increments of keyframe states (K, 15), features (J, 3), clock (s) and lever arm (m) (n,)."""
+    """A step of Gauss-Newton.
+
+    Attributes:
+        states: (K, 15) increments of the keyframe states.
+        points: (J, 3) of the features.
+        predicted: by how much the quadratic model says that the cost decreases.
+        fixes: (n,) of clock (s) and lever arm (m).
+    """
 
     states: FloatArray
     points: FloatArray
+    predicted: float
     fixes: FloatArray = field(default_factory=lambda: np.zeros(0))
 
 
@@ -225,19 +233,24 @@ class Factor:
 
     def step(self, linear: LinearCost) -> Step:
         """The Gauss-Newton step from where a cost is linearised, by the factor at any estimates."""
-        by_state = linear.chain.gradient.copy()
+        by_state, gradient = linear.chain.gradient.copy(), linear.chain.gradient.copy()
         by_pose, by_point = linear.images.gradient(len(by_state))
         reduced, t = self.features.reduced(by_pose, by_point)
         by_state[:, :6] += reduced
+        gradient[:, :6] += by_pose
         eliminated = self.features.fixes
         by_fixes, shared = np.zeros(0), np.zeros(0)
         if linear.fixes is not None and eliminated is not None:
             by_pose, by_fixes = linear.fixes.gradient(len(by_state))
             by_state[:, :6] += eliminated.reduced(by_pose, by_fixes)
+            gradient[:, :6] += by_pose
         states = self.states.times_covariance(by_state[:, :, None])[:, :, 0]
         if eliminated is not None:
             shared = eliminated.step(by_fixes, states[:, :6])
-        return Step(states, self.features.points(t, states[:, :6]), shared)
+        points = self.features.points(t, states[:, :6])
+        # the step δ solves H δ = g, so that the model gᵀ δ - ½ δᵀ H δ is ½ gᵀ δ
+        predicted = 0.5 * float(np.sum(gradient * states) + np.sum(by_point * points))
+        return Step(states, points, predicted + 0.5 * float(by_fixes @ shared), shared)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -17,7 +17,7 @@ Keyframe k has the pose X(k), the velocity V(k) and the bias B(k).
 from __future__ import annotations
 
 from dataclasses import replace
-from itertools import pairwise
+from itertools import pairwise, starmap
 
 import gtsam
 import numpy as np
@@ -159,7 +159,14 @@ class RecordingFactors:
         self._backend, self._config = backend, config
         self.noise = ImuNoiseFactors(least=least_noise)
         between = list(pairwise(segment.keyframe_stamps_ns.tolist()))
-        self._samples = [segment.imu.between(*interval) for interval in between]
+        samples = [segment.imu.between(*interval) for interval in between]
+        self._steps = [block.short_steps() for block in samples]
+        self._changes = [MotionChange()] * len(samples)
+        if backend.noise.adaptive.enabled:
+            self._changes = list(starmap(MotionChange.between, zip([None, *samples], samples)))
+        # variances of non-stationary noise add up
+        frames = [segment.noise[i + 1 : j + 1] for i, j in pairwise(segment.keyframes.tolist())]
+        self._learned = [np.sqrt(np.mean(noise**2, axis=0)).tolist() for noise in frames]
         longest_s = backend.noise.max_imu_gap_s
         self._gaps = [segment.imu.largest_gap_s(*interval) > longest_s for interval in between]
 
@@ -265,25 +272,18 @@ class RecordingFactors:
     def _noise_factors(self, k: int) -> tuple[float, float, float]:
         """Factors on all noise after keyframe k; on white noise of gyroscope; of accelerometer."""
         scale = IMU_GAP_SCALE if self._gaps[k] else 1.0
-        i, j = self._segment.keyframes[k : k + 2]
-        # variances of non-stationary noise add up
-        learned = np.sqrt(np.mean(self._segment.noise[i + 1 : j + 1] ** 2, axis=0))
-        gyro, accel = self.noise.white(*learned.tolist())
+        gyro, accel = self.noise.white(*self._learned[k])
         return self._backend.noise.imu_scale, scale * gyro, scale * accel
 
     def _dynamics(self, values: gtsam.Values) -> list[gtsam.NonlinearFactor]:
         """IMU factors between consecutive keyframes, and zero-velocity factors."""
         factors: list[gtsam.NonlinearFactor] = []
         noise = self._backend.noise
-        calibrated, before = self.noise.walks(self._rig.imu), None
+        calibrated = self.noise.walks(self._rig.imu)
         for k, (i, j) in enumerate(pairwise(self._segment.keyframes.tolist())):
-            samples = self._samples[k]
-            imu_noise = calibrated
-            if noise.adaptive.enabled:
-                imu_noise = MotionChange.between(before, samples).added_to(calibrated)
+            imu_noise = self._changes[k].added_to(calibrated)
             params = imu_noise.preintegration_params(noise.gravity, *self._noise_factors(k))
-            pim = samples.preintegrated(values.atConstantBias(B(k)), params)
-            before = samples
+            pim = self._steps[k].preintegrated(values.atConstantBias(B(k)), params)
             factors.append(imu_factor(k, k + 1, pim))
             if np.isfinite(self._segment.still_sigmas[i + 1 : j + 1]).all():
                 factors += zero_velocity_factors(k, k + 1, self._segment.still_sigmas[j])
