@@ -102,7 +102,7 @@ def drift_consensus(
     Returns:
         (P,) which matches are in the set.
     """
-    count, width = offsets.shape
+    count = len(offsets)
     best, most = np.zeros(4), -1
     chosen, square = np.zeros(count, np.bool_), limit * limit
     for s in range(len(pairs)):
@@ -139,9 +139,7 @@ def _left(
 
 
 @compiled()
-def _fitted(
-    J: FloatArray, offsets: FloatArray, rows: IntArray, weights: FloatArray
-) -> FloatArray:
+def _fitted(J: FloatArray, offsets: FloatArray, rows: IntArray, weights: FloatArray) -> FloatArray:
     """The drift (4,) that fits some matches best, by Cholesky's method."""
     L, x = np.zeros((4, 4)), np.zeros(4)
     for a in range(4):

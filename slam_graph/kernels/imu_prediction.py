@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import math
+from itertools import pairwise
 
 import numpy as np
 
@@ -116,7 +117,7 @@ def predict_motion_numpy(
 ) -> None:
     """`predict_motion` in NumPy."""
     given = rotations[known], positions[known], velocities[known]
-    for k, (begin, end) in enumerate(zip(known[:-1], known[1:], strict=True)):
+    for k, (begin, end) in enumerate(pairwise(known)):
         R, p, v = (values[k].copy() for values in given)
         for n in range(begin, end):
             for s in range(steps[n], steps[n + 1]):

@@ -84,7 +84,7 @@ def points_ahead_numpy(
     ahead = np.flatnonzero(used & (in_camera[:, 2] > nearest))
     found = in_camera[ahead, :2] / in_camera[ahead, 2:]
     inside = np.sum(found**2, axis=1) < square
-    count = np.count_nonzero(inside)
+    count = int(np.count_nonzero(inside))
     rows[:count], normalized[:count] = ahead[inside], found[inside]
     return count
 

@@ -84,10 +84,9 @@ def minimized(
         if decrease <= tolerance * value * (1.0 if fresh else _CAUTION):
             break
         damping *= 0.1 if fresh else 1.0
+        slow = not fresh and decrease > _CONTRACTION * before
         as_predicted = abs(decrease - step.predicted) < _AGREEMENT * step.predicted
-        if decrease > _SMALL_STEP * value and not (fresh and as_predicted):
-            factor = None
-        elif not fresh and decrease > _CONTRACTION * before:
+        if slow or (decrease > _SMALL_STEP * value and not (fresh and as_predicted)):
             factor = None
         before = decrease
     if not math.isfinite(value):

@@ -178,7 +178,7 @@ def _predicted(
     imu: ImuBuffer,
     params: gtsam.PreintegrationCombinedParams,
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Rotations (N, 3, 3), positions and velocities (N, 3), each predicted from the keyframe before.
+    """Rotations (N, 3, 3), positions and velocities (N, 3), predicted from the keyframe before.
 
     Args:
         keyframes: their states.

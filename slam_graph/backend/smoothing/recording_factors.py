@@ -17,7 +17,7 @@ Keyframe k has the pose X(k), the velocity V(k) and the bias B(k).
 from __future__ import annotations
 
 from dataclasses import replace
-from itertools import pairwise, starmap
+from itertools import pairwise
 
 import gtsam
 import numpy as np
@@ -163,7 +163,7 @@ class RecordingFactors:
         self._steps = [block.short_steps() for block in samples]
         self._changes = [MotionChange()] * len(samples)
         if backend.noise.adaptive.enabled:
-            self._changes = list(starmap(MotionChange.between, zip([None, *samples], samples)))
+            self._changes = list(map(MotionChange.between, [None, *samples[:-1]], samples))
         # variances of non-stationary noise add up
         frames = [segment.noise[i + 1 : j + 1] for i, j in pairwise(segment.keyframes.tolist())]
         self._learned = [np.sqrt(np.mean(noise**2, axis=0)).tolist() for noise in frames]

@@ -276,7 +276,7 @@ class TrackRecordingSequence(RecordedSequence):
         before, count = int(counts[:first].sum()), int(counts[first:stop].sum())
         offset = before * FEATURE_RECORD.itemsize
         rows = np.fromfile(self.path / FEATURES, FEATURE_RECORD, count, offset=offset)
-        if not (Files.are_measurable(rows["pixel"]) & Files.are_measurable(rows["normalized"])).all():
+        if not all(Files.are_measurable(rows[name]).all() for name in ("pixel", "normalized")):
             raise DataError(f"{self.path / FEATURES}: a feature is not finite, or too far; {AGAIN}")
         return counts[first:stop], rows
 
