@@ -19,7 +19,6 @@ __all__ = [
     "Sequence",
     "SequenceInfo",
     "TrackRecorder",
-    "TrackRecordingSequence",
     "check_sequence",
     "dataset_from_arrays",
     "kalibr_text",
@@ -39,7 +38,6 @@ if TYPE_CHECKING:
     from slam_graph.datasets.dataset_registry import DATASETS, Format, open_dataset
     from slam_graph.datasets.formats.euroc_writer import EurocWriter
     from slam_graph.datasets.formats.track_recorder import TrackRecorder
-    from slam_graph.datasets.formats.track_recording import TrackRecordingSequence
     from slam_graph.datasets.groundtruth import read_groundtruth
     from slam_graph.datasets.memory_sequence import dataset_from_arrays
     from slam_graph.datasets.sequence import ReaderOptions, RecordedSequence, Sequence, SequenceInfo
@@ -53,7 +51,6 @@ else:
             "dataset_registry": ("DATASETS", "Format", "open_dataset"),
             "formats.euroc_writer": ("EurocWriter",),
             "formats.track_recorder": ("TrackRecorder",),
-            "formats.track_recording": ("TrackRecordingSequence",),
             "groundtruth": ("read_groundtruth",),
             "memory_sequence": ("dataset_from_arrays",),
             "sequence": ("ReaderOptions", "RecordedSequence", "Sequence", "SequenceInfo"),

@@ -25,7 +25,7 @@ from slam_graph.backend.depth_camera import with_depth_camera, with_depth_observ
 from slam_graph.backend.dynamics import motionless_samples
 from slam_graph.backend.initialization.clock_change import ClockChanges
 from slam_graph.backend.smoothing.smoothing_config import FinalBaConfig
-from slam_graph.datasets import ReaderOptions, TrackRecorder, TrackRecordingSequence
+from slam_graph.datasets import TrackRecorder
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.sensors import (
     AidingData,
@@ -77,8 +77,7 @@ class FrameLog:
         # the depth sensor is a camera in it, and the samples of the dynamics are those of an IMU
         recorded = replace(self.rig, depth=None, has_imu=True)
         self._config = config
-        self._path = folder / "frames"
-        self._recorder = TrackRecorder(self._path, recorded)
+        self._recorder = TrackRecorder(folder / "frames", recorded)
         self._frames = array("q")
         self._keyframes = array("q")  # numbers of frames
         self._noise = array("d")
@@ -199,7 +198,7 @@ class FrameLog:
         ahead_s = replace(rig.shifted(clocks.latest_s), has_imu=True).end_offset_s
         end_ns = self._frames[stop - 1] + max(0, round(ahead_s * 1e9))
         blocks: list[ImuData] = []
-        for block in self._recorded.imu_blocks(begin_ns):
+        for block in self._recorder.recorded(_Silent()).imu_blocks(begin_ns):
             beyond = int(np.searchsorted(block.stamps_ns, end_ns)) + 1
             blocks.append(block[:beyond])
             if beyond <= len(block):
@@ -208,12 +207,9 @@ class FrameLog:
 
     def features(self, first: int, stop: int) -> tuple[IntArray, NDArray[np.void]]:
         """Features of the frames `first` to `stop - 1`, as `TrackRecordingSequence.features`."""
-        return self._recorded.features(self._frames[first], self._frames[stop - 1])
-
-    @cached_property
-    def _recorded(self) -> TrackRecordingSequence:
-        """All frames as they were recorded: opened once for each part."""
-        return TrackRecordingSequence(self._path, ReaderOptions(diagnostics=_Silent()))
+        return self._recorder.recorded(_Silent()).features(
+            self._frames[first], self._frames[stop - 1]
+        )
 
     def _follows(self, frame_ns: int) -> bool:
         """Whether a frame is later than the others and within the IMU samples."""

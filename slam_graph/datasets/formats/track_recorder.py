@@ -20,8 +20,10 @@ from slam_graph.datasets.formats import track_recording as layout
 from slam_graph.datasets.formats.recorded_files import packed
 from slam_graph.datasets.formats.recorded_objects import ObjectColumns, unknown_labels
 from slam_graph.datasets.formats.recorded_states import save_state, save_trajectory
+from slam_graph.datasets.sequence import ReaderOptions
 from slam_graph.datasets.streams.aiding_files import aiding_texts
 from slam_graph.datasets.streams.mask_images import LARGEST_LABEL
+from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import DataError
 from slam_graph.files import Files
 from slam_graph.geometry import NavState, Trajectory
@@ -106,6 +108,18 @@ class TrackRecorder:
                 raise
         finally:
             shutil.rmtree(self._folder, ignore_errors=True)
+
+    def recorded(self, diagnostics: Diagnostics) -> layout.TrackRecordingSequence:
+        """What was recorded, once the recorder is closed.
+
+        Args:
+            diagnostics: where faults are counted as it is read.
+
+        Raises:
+            DataError: if a file is missing or cut.
+        """
+        options = ReaderOptions(diagnostics=diagnostics)
+        return layout.TrackRecordingSequence(self.path, options)
 
     def write(self, imu: ImuData, frame: FeatureFrame, aiding: AidingData | None = None) -> None:
         """Append a packet.
