@@ -78,6 +78,49 @@ def mixture_probabilities_numpy(
     return probabilities
 
 
+@compiled()
+def _left(
+    J: FloatArray, offsets: FloatArray, p: int, drift: FloatArray, residuals: FloatArray
+) -> float:
+    """Squared length of what is left of the offset of match p, which is written to residuals."""
+    square = 0.0
+    for i in range(offsets.shape[1]):
+        rest = offsets[p, i]
+        for a in range(4):
+            rest -= J[p, i, a] * drift[a]
+        residuals[p, i] = rest
+        square += rest * rest
+    return square
+
+
+@compiled()
+def _fitted(J: FloatArray, offsets: FloatArray, rows: IntArray, weights: FloatArray) -> FloatArray:
+    """The drift (4,) that fits some matches best, by Cholesky's method."""
+    L, x = np.zeros((4, 4)), np.zeros(4)
+    for a in range(4):
+        L[a, a] = weights[a]
+    for p in rows:
+        for i in range(offsets.shape[1]):
+            for a in range(4):
+                x[a] += J[p, i, a] * offsets[p, i]
+                for b in range(a + 1):
+                    L[a, b] += J[p, i, a] * J[p, i, b]
+    for a in range(4):
+        for b in range(a + 1):
+            rest = L[a, b]
+            for c in range(b):
+                rest -= L[a, c] * L[b, c]
+            L[a, b] = math.sqrt(rest) if a == b else rest / L[b, b]
+        for b in range(a):
+            x[a] -= L[a, b] * x[b]
+        x[a] /= L[a, a]
+    for a in range(3, -1, -1):
+        for b in range(a + 1, 4):
+            x[a] -= L[b, a] * x[b]
+        x[a] /= L[a, a]
+    return x
+
+
 @compiled("b1[::1](f8[:, :, ::1], f8[:, ::1], i8[:, ::1], f8[::1], f8, i8, f8[:, ::1])")
 def drift_consensus(
     J: FloatArray,
@@ -121,49 +164,6 @@ def drift_consensus(
         if turn < refinements:
             best = _fitted(J, offsets, np.flatnonzero(chosen), weights)
     return chosen
-
-
-@compiled()
-def _left(
-    J: FloatArray, offsets: FloatArray, p: int, drift: FloatArray, residuals: FloatArray
-) -> float:
-    """Squared length of what is left of the offset of match p, which is written to residuals."""
-    square = 0.0
-    for i in range(offsets.shape[1]):
-        rest = offsets[p, i]
-        for a in range(4):
-            rest -= J[p, i, a] * drift[a]
-        residuals[p, i] = rest
-        square += rest * rest
-    return square
-
-
-@compiled()
-def _fitted(J: FloatArray, offsets: FloatArray, rows: IntArray, weights: FloatArray) -> FloatArray:
-    """The drift (4,) that fits some matches best, by Cholesky's method."""
-    L, x = np.zeros((4, 4)), np.zeros(4)
-    for a in range(4):
-        L[a, a] = weights[a]
-    for p in rows:
-        for i in range(offsets.shape[1]):
-            for a in range(4):
-                x[a] += J[p, i, a] * offsets[p, i]
-                for b in range(a + 1):
-                    L[a, b] += J[p, i, a] * J[p, i, b]
-    for a in range(4):
-        for b in range(a + 1):
-            rest = L[a, b]
-            for c in range(b):
-                rest -= L[a, c] * L[b, c]
-            L[a, b] = math.sqrt(rest) if a == b else rest / L[b, b]
-        for b in range(a):
-            x[a] -= L[a, b] * x[b]
-        x[a] /= L[a, a]
-    for a in range(3, -1, -1):
-        for b in range(a + 1, 4):
-            x[a] -= L[b, a] * x[b]
-        x[a] /= L[a, a]
-    return x
 
 
 def drift_consensus_numpy(

@@ -18,6 +18,23 @@ _SMALL = 1e-8
 """Squared angle below which the series of sine and cosine takes their place."""
 
 
+@compiled()
+def _exponential(rate: FloatArray, seconds: float, turn: FloatArray) -> None:
+    """The rotation (3, 3) by a rate over a time (Rodrigues)."""
+    x, y, z = rate[0] * seconds, rate[1] * seconds, rate[2] * seconds
+    square = x * x + y * y + z * z
+    if square > _SMALL:
+        angle = math.sqrt(square)
+        sine, cosine = math.sin(angle) / angle, (1.0 - math.cos(angle)) / square
+    else:
+        sine, cosine = 1.0 - square / 6.0, 0.5 - square / 24.0
+    turn[0, 0], turn[1, 1] = 1.0 - cosine * (y * y + z * z), 1.0 - cosine * (x * x + z * z)
+    turn[2, 2] = 1.0 - cosine * (x * x + y * y)
+    turn[0, 1], turn[1, 0] = cosine * x * y - sine * z, cosine * x * y + sine * z
+    turn[0, 2], turn[2, 0] = cosine * x * z + sine * y, cosine * x * z - sine * y
+    turn[1, 2], turn[2, 1] = cosine * y * z - sine * x, cosine * y * z + sine * x
+
+
 @compiled(
     "void(f8[::1], f8[:, ::1], f8[:, ::1], i8[::1], i8[::1], f8[:, :, ::1], f8[:, ::1],"
     " f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[::1])"
@@ -54,52 +71,43 @@ def predict_motion(
         accel_biases: (K, 3) likewise, m/s².
         gravity: (3,) m/s².
     """
-    R, p, v = np.empty((3, 3)), np.empty(3), np.empty(3)
-    rate, force, turn, turned = np.empty(3), np.empty(3), np.empty((3, 3)), np.empty((3, 3))
-    after_R, after_p = rotations[known[0]].copy(), positions[known[0]].copy()
-    after_v = velocities[known[0]].copy()
+    R, turn, turned = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
+    after_R, after = np.empty((3, 3)), np.empty((2, 3))
+    p, v, rate, force = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
+    for i in range(3):
+        after[0, i], after[1, i] = positions[known[0], i], velocities[known[0], i]
+        for j in range(3):
+            after_R[i, j] = rotations[known[0], i, j]
     for k in range(len(known) - 1):
-        R[:], p[:], v[:] = after_R, after_p, after_v
         end = known[k + 1]
-        after_R[:], after_p[:], after_v[:] = rotations[end], positions[end], velocities[end]
+        for i in range(3):  # what is known at the end is overwritten below
+            p[i], v[i] = after[0, i], after[1, i]
+            after[0, i], after[1, i] = positions[end, i], velocities[end, i]
+            for j in range(3):
+                R[i, j], after_R[i, j] = after_R[i, j], rotations[end, i, j]
         for n in range(known[k], end):
             for s in range(steps[n], steps[n + 1]):
                 dt = durations[s]
+                half = 0.5 * dt
                 for i in range(3):
                     rate[i] = rates[s, i] - gyro_biases[k, i]
                     force[i] = forces[s, i] - accel_biases[k, i]
-                half = 0.5 * dt
                 x = force[0] + half * (rate[1] * force[2] - rate[2] * force[1])
                 y = force[1] + half * (rate[2] * force[0] - rate[0] * force[2])
                 z = force[2] + half * (rate[0] * force[1] - rate[1] * force[0])
+                _exponential(rate, dt, turn)
                 for i in range(3):
                     a = R[i, 0] * x + R[i, 1] * y + R[i, 2] * z + gravity[i]
                     p[i] += dt * (v[i] + half * a)
                     v[i] += dt * a
-                _exponential(rate, dt, turn)
-                for i in range(3):
                     for j in range(3):
                         first, second = R[i, 0] * turn[0, j], R[i, 1] * turn[1, j]
                         turned[i, j] = first + second + R[i, 2] * turn[2, j]
-                R[:] = turned
-            rotations[n + 1], positions[n + 1], velocities[n + 1] = R, p, v
-
-
-@compiled()
-def _exponential(rate: FloatArray, seconds: float, turn: FloatArray) -> None:
-    """The rotation (3, 3) by a rate over a time (Rodrigues)."""
-    x, y, z = rate[0] * seconds, rate[1] * seconds, rate[2] * seconds
-    square = x * x + y * y + z * z
-    if square > _SMALL:
-        angle = math.sqrt(square)
-        sine, cosine = math.sin(angle) / angle, (1.0 - math.cos(angle)) / square
-    else:
-        sine, cosine = 1.0 - square / 6.0, 0.5 - square / 24.0
-    turn[0, 0], turn[1, 1] = 1.0 - cosine * (y * y + z * z), 1.0 - cosine * (x * x + z * z)
-    turn[2, 2] = 1.0 - cosine * (x * x + y * y)
-    turn[0, 1], turn[1, 0] = cosine * x * y - sine * z, cosine * x * y + sine * z
-    turn[0, 2], turn[2, 0] = cosine * x * z + sine * y, cosine * x * z - sine * y
-    turn[1, 2], turn[2, 1] = cosine * y * z - sine * x, cosine * y * z + sine * x
+                R, turned = turned, R
+            for i in range(3):
+                positions[n + 1, i], velocities[n + 1, i] = p[i], v[i]
+                for j in range(3):
+                    rotations[n + 1, i, j] = R[i, j]
 
 
 def predict_motion_numpy(

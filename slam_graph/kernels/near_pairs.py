@@ -25,6 +25,38 @@ __all__ = [
 _Pixels = NDArray[np.float32]
 
 
+@compiled()
+def _strips(points: FloatArray, distance: float) -> tuple[float, float, int]:
+    """Vertical strips of the plane, as many as there are points at most.
+
+    Returns:
+        Where the first one begins, their width, at least `distance`, and their number.
+    """
+    left, right = math.inf, -math.inf
+    for j in range(len(points)):
+        if math.isfinite(points[j, 0]):
+            left, right = min(left, points[j, 0]), max(right, points[j, 0])
+    if not left <= right:
+        return 0.0, 1.0, 0
+    width = max(distance, (right - left) / len(points), 1e-300)
+    return left, width, math.floor((right - left) / width) + 1
+
+
+@compiled()
+def _strip(x: float, left: float, width: float, strips: int) -> int:
+    """The strip of a coordinate; -2 and one or two more than there are for all that are far off."""
+    return math.floor(min(max((x - left) / width, -2.0), strips + 1.0))
+
+
+@compiled()
+def _longer(pairs: IntArray, count: int) -> IntArray:
+    """The first of the rows in an array of another length."""
+    longer = np.empty((count, 2), np.int64)
+    for k in range(min(count, len(pairs))):
+        longer[k, 0], longer[k, 1] = pairs[k, 0], pairs[k, 1]
+    return longer
+
+
 @compiled("i8[:, ::1](f8[:, ::1], f8[:, ::1], f8)")
 def near_pairs(first: FloatArray, second: FloatArray, distance: float) -> IntArray:
     """Which points are at most so far apart; none that is not finite.
@@ -37,64 +69,37 @@ def near_pairs(first: FloatArray, second: FloatArray, distance: float) -> IntArr
     Returns:
         (P, 2) rows of both, ascending.
     """
-    starts, order, left, width = _strips(second, distance)
-    strips = len(starts) - 1
+    left, width, strips = _strips(second, distance)
+    starts, order = np.zeros(strips + 2, np.int64), np.empty(len(second), np.int64)
+    for j in range(len(second)):
+        if math.isfinite(second[j, 0]):
+            starts[_strip(second[j, 0], left, width, strips) + 2] += 1
+    for s in range(2, strips + 2):
+        starts[s] += starts[s - 1]
+    for j in range(len(second)):  # now strip s begins at starts[s + 1], and in the end at starts[s]
+        if math.isfinite(second[j, 0]):
+            s = _strip(second[j, 0], left, width, strips) + 1
+            order[starts[s]] = j
+            starts[s] += 1
     pairs, count, limit = np.empty((4 * len(first) + 16, 2), np.int64), 0, distance * distance
     for i in range(len(first)):
-        x, y = first[i]
-        if not math.isfinite(x):
+        if not math.isfinite(first[i, 0]):
             continue
-        own, begin = math.floor(min(max((x - left) / width, -2.0), strips + 2.0)), count
-        for s in range(max(own - 1, 0), min(own + 2, strips)):
-            for k in range(starts[s], starts[s + 1]):
-                j = order[k]
-                dx, dy = second[j, 0] - x, second[j, 1] - y
-                if not dx * dx + dy * dy <= limit:
-                    continue
-                if count == len(pairs):
-                    longer = np.empty((2 * count, 2), np.int64)
-                    longer[:count] = pairs
-                    pairs = longer
-                place = count
-                while place > begin and pairs[place - 1, 1] > j:
-                    pairs[place, 1] = pairs[place - 1, 1]
-                    place -= 1
-                pairs[count, 0], pairs[place, 1] = i, j
-                count += 1
-    return pairs[:count].copy()
-
-
-@compiled()
-def _strips(points: FloatArray, distance: float) -> tuple[IntArray, IntArray, float, float]:
-    """Vertical strips of the plane, at least `distance` wide, as many as there are points at most.
-
-    Returns:
-        starts: (S + 1,) of each strip in `order`.
-        order: (N,) rows of the points, strip by strip, ascending in each.
-        left: edge of the first strip.
-        width: of a strip.
-    """
-    left, right = math.inf, -math.inf
-    for point in points:
-        if math.isfinite(point[0]):
-            left, right = min(left, point[0]), max(right, point[0])
-    if not left <= right:
-        left, right = 0.0, 0.0
-    width = max(distance, (right - left) / len(points), 1e-300) if len(points) else 1.0
-    strip = np.full(len(points), -1)
-    starts = np.zeros(math.floor((right - left) / width) + 2, np.int64)
-    for j in range(len(points)):
-        if math.isfinite(points[j, 0]):
-            strip[j] = math.floor((points[j, 0] - left) / width)
-            starts[strip[j] + 1] += 1
-    for s in range(1, len(starts)):
-        starts[s] += starts[s - 1]
-    free, order = starts.copy(), np.empty(len(points), np.int64)
-    for j in range(len(points)):
-        if strip[j] >= 0:
-            order[free[strip[j]]] = j
-            free[strip[j]] += 1
-    return starts, order, left, width
+        own, begin = _strip(first[i, 0], left, width, strips), count
+        for k in range(starts[max(own - 1, 0)], starts[max(min(own + 2, strips), 0)]):
+            j = order[k]
+            dx, dy = second[j, 0] - first[i, 0], second[j, 1] - first[i, 1]
+            if not dx * dx + dy * dy <= limit:
+                continue
+            if count == len(pairs):
+                pairs = _longer(pairs, 2 * count)
+            place = count
+            while place > begin and pairs[place - 1, 1] > j:
+                pairs[place, 1] = pairs[place - 1, 1]
+                place -= 1
+            pairs[count, 0], pairs[place, 1] = i, j
+            count += 1
+    return _longer(pairs, count)
 
 
 def near_pairs_numpy(first: FloatArray, second: FloatArray, distance: float) -> IntArray:
