@@ -15,7 +15,7 @@ from benchmarks.metric import Metric
 from benchmarks.openvins_sim import mean_nees
 from benchmarks.real_imu import CAMERA, CAMERAS
 from benchmarks.recordings import FIRST_HELD_OUT_SEED, HELD_OUT
-from benchmarks.running import Run
+from benchmarks.running import Run, read_once
 from benchmarks.suite import CORE, Benchmark, Outcome
 from slam_graph.datasets.sequence import Sequence
 from slam_graph.evaluation.consistency import mean_bounds
@@ -36,9 +36,9 @@ def measure(data: Path) -> Outcome:
     """Errors on the flights after alignment in SE(3); errors and NEES over the seeds without."""
     outcome = Outcome()
     sources = find_sources([f"sim:{data / path}" for path in HELD_OUT], CLIP_S, CAMERA)
-    flights = [(source, source.open(FIRST_HELD_OUT_SEED, CAMERAS)) for source in sources]
+    flights = [(source, read_once(source.open(FIRST_HELD_OUT_SEED, CAMERAS))) for source in sources]
     (simulated,) = find_sources(["sim:figure8"], SIMULATED_S, SIMULATED)
-    drawn = [simulated.open(seed, CAMERAS) for seed in SEEDS]
+    drawn = [read_once(simulated.open(seed, CAMERAS)) for seed in SEEDS]
     for name in CORE:
         for source, flight in flights:
             run = Run(flight, name, CAMERAS)

@@ -16,8 +16,9 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.metric import QUANTISED_TOLERANCE, Metric, info
-from benchmarks.running import Errors, Run, clipped, within
+from benchmarks.running import Errors, Run, clipped, read_once, within
 from benchmarks.suite import CORE, GROWING, PEERS, UNBOUNDED, Benchmark, Outcome
+from slam_graph.datasets.dataset_registry import open_dataset
 from slam_graph.datasets.groundtruth import read_groundtruth
 from slam_graph.evaluation.consistency import nees
 
@@ -63,13 +64,14 @@ def measure(data: Path, cameras: int, algorithms: Sequence[str]) -> Outcome:
     """Errors and mean NEES (3 is ideal) of our estimates and of OpenVINS' over the same time."""
     outcome = Outcome()
     folder = data / RECORDING
+    recording = read_once(open_dataset(folder, cameras=cameras))
     p_bar, q_bar = POSITION_BARS_M[cameras], ORIENTATION_BARS_DEG[cameras]
     ours: dict[str, Quality] = {}
     theirs: Quality | None = None
     for name in algorithms:
         clip_s = CLIP_S if name in GROWING else None
         given = ["backend.initialization.mode=given"]
-        run = Run(folder, name, cameras, overrides=given, duration_s=clip_s)
+        run = Run(recording, name, cameras, overrides=given, duration_s=clip_s)
         errors = run.errors("none")
         quality = Quality(errors.position_m, errors.orientation_deg, *mean_nees(run))
         figures = [

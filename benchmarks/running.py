@@ -23,6 +23,7 @@ from slam_graph.geometry.trajectory_alignment import AlignmentMode
 from slam_graph.pipeline.observers import NullViewer
 from slam_graph.pipeline.run_recording import run
 from slam_graph.pipeline.stage import EstimatedFrame
+from slam_graph.sensors import Packet
 
 
 @dataclass(frozen=True, slots=True)
@@ -159,6 +160,24 @@ def decoded_once() -> Iterator[None]:
         yield
     finally:
         images.decode_grey = decode
+
+
+def read_once(recording: Sequence) -> Sequence:
+    """The recording, whose packets are read, or simulated, when they are asked for first.
+
+    For several runs over the whole of a recording of tracks, which fits into memory.
+    """
+    read, kept = recording.packets, list[Packet]()
+
+    def packets(start_ns: int | None = None, end_ns: int | None = None) -> Iterator[Packet]:
+        if start_ns is not None or end_ns is not None:
+            return read(start_ns, end_ns)
+        if not kept:
+            kept.extend(read())
+        return iter(kept)
+
+    recording.packets = packets  # type: ignore[method-assign]
+    return recording
 
 
 def clipped(algorithm: str, duration_s: float | None) -> str:
