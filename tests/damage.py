@@ -12,9 +12,13 @@ import shutil
 import time
 import traceback
 from collections.abc import Callable
+from functools import lru_cache
 from pathlib import Path
 
+import pytest
+
 from slam_graph.errors import SlamGraphError
+from slam_graph.settings import tree
 
 CAMPAIGN = int(os.environ.get("SLAM_GRAPH_MUTATIONS", "0"))
 SEED = os.environ.get("SLAM_GRAPH_MUTATIONS_SEED", str(time.time_ns()) if CAMPAIGN else "0")
@@ -103,12 +107,17 @@ def tried(
     read()  # it is valid
     read()  # what is loaded once is loaded
     failures: dict[str, str] = {}
-    for number in range(CAMPAIGN or in_ci):
-        file.write_bytes(damaged(whole, edits(number)))
-        failure = failure_of(read, most_s)
-        if failure is not None and failure[0] not in failures:
-            kept = shutil.copy(file, file.with_name(f"{file.name}.damaged{number}"))
-            failures[failure[0]] = f"mutation {number} of seed {SEED}, kept as {kept}: {failure[1]}"
+    with pytest.MonkeyPatch.context() as patch:
+        # of the other files, which are the same each time, YAML is parsed once
+        patch.setattr(tree, "parse_node", lru_cache(maxsize=16)(tree.parse_node))
+        for number in range(CAMPAIGN or in_ci):
+            file.unlink()  # a file that is cut and written again is waited for until it is on disk
+            file.write_bytes(damaged(whole, edits(number)))
+            failure = failure_of(read, most_s)
+            if failure is not None and failure[0] not in failures:
+                kept = shutil.copy(file, file.with_name(f"{file.name}.damaged{number}"))
+                said = f"mutation {number} of seed {SEED}, kept as {kept}: {failure[1]}"
+                failures[failure[0]] = said
     file.write_bytes(whole)
     assert not failures, "\n\n".join(failures.values())
 
