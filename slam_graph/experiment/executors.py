@@ -206,7 +206,7 @@ class _TaskProcess(subprocess.Popen[str]):
         theirs, self._lifeline = os.pipe()  # its end is closed also when this process is killed
         try:
             super().__init__(
-                [sys.executable, "-m", "slam_graph.experiment.tasks", task],
+                [sys.executable, "-m", "slam_graph.experiment.task_process", task],
                 stdin=theirs,
                 stdout=subprocess.DEVNULL,
                 stderr=subprocess.PIPE,

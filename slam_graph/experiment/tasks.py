@@ -3,7 +3,7 @@
 """Tasks and their data; those of a comparison: record tracks once, run an algorithm on them.
 
 A task is a JSON object and is done in a process of its own
-(`python -m slam_graph.experiment.tasks TASK`). So peak memory is that of one run, a crash does not
+(`slam_graph.experiment.task_process`). So peak memory is that of one run, a crash does not
 affect other runs, and a cluster needs no more than a shared folder.
 """
 
@@ -279,7 +279,7 @@ Task = RecordTask | RunTask | BatchTask
 _ANY_TASK: TypeAdapter[Task] = TypeAdapter(Annotated[Task, Field(discriminator="kind")])
 
 
-def main() -> None:
+def do_given_task() -> None:
     """Do the task given as JSON in the first argument.
 
     Standard input may be a pipe: when its other end is closed, the task is given up.
@@ -288,7 +288,3 @@ def main() -> None:
     if stat.S_ISFIFO(os.fstat(sys.stdin.fileno()).st_mode):
         Interrupts.end_with(sys.stdin.fileno())
     _ANY_TASK.validate_json(sys.argv[1]).do()
-
-
-if __name__ == "__main__":
-    main()
