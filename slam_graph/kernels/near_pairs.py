@@ -69,37 +69,41 @@ def near_pairs(first: FloatArray, second: FloatArray, distance: float) -> IntArr
     Returns:
         (P, 2) rows of both, ascending.
     """
-    left, width, strips = _strips(second, distance)
-    starts, order = np.zeros(strips + 2, np.int64), np.empty(len(second), np.int64)
-    for j in range(len(second)):
-        if math.isfinite(second[j, 0]):
-            starts[_strip(second[j, 0], left, width, strips) + 2] += 1
+    left, width, strips = _strips(first, distance)
+    starts, order = np.zeros(strips + 2, np.int64), np.empty(len(first), np.int64)
+    for i in range(len(first)):
+        if math.isfinite(first[i, 0]):
+            starts[_strip(first[i, 0], left, width, strips) + 2] += 1
     for s in range(2, strips + 2):
         starts[s] += starts[s - 1]
-    for j in range(len(second)):  # now strip s begins at starts[s + 1], and in the end at starts[s]
-        if math.isfinite(second[j, 0]):
-            s = _strip(second[j, 0], left, width, strips) + 1
-            order[starts[s]] = j
+    for i in range(len(first)):  # now strip s begins at starts[s + 1], and in the end at starts[s]
+        if math.isfinite(first[i, 0]):
+            s = _strip(first[i, 0], left, width, strips) + 1
+            order[starts[s]] = i
             starts[s] += 1
     pairs, count, limit = np.empty((4 * len(first) + 16, 2), np.int64), 0, distance * distance
-    for i in range(len(first)):
-        if not math.isfinite(first[i, 0]):
+    ends = np.zeros(len(first) + 1, np.int64)
+    for j in range(len(second)):
+        if not math.isfinite(second[j, 0]):
             continue
-        own, begin = _strip(first[i, 0], left, width, strips), count
+        own = _strip(second[j, 0], left, width, strips)
         for k in range(starts[max(own - 1, 0)], starts[max(min(own + 2, strips), 0)]):
-            j = order[k]
+            i = order[k]
             dx, dy = second[j, 0] - first[i, 0], second[j, 1] - first[i, 1]
-            if not dx * dx + dy * dy <= limit:
-                continue
-            if count == len(pairs):
-                pairs = _longer(pairs, 2 * count)
-            place = count
-            while place > begin and pairs[place - 1, 1] > j:
-                pairs[place, 1] = pairs[place - 1, 1]
-                place -= 1
-            pairs[count, 0], pairs[place, 1] = i, j
-            count += 1
-    return _longer(pairs, count)
+            if dx * dx + dy * dy <= limit:
+                if count == len(pairs):
+                    pairs = _longer(pairs, 2 * count)
+                pairs[count, 0], pairs[count, 1] = i, j
+                ends[i + 1] += 1
+                count += 1
+    for i in range(len(first)):
+        ends[i + 1] += ends[i]
+    found = np.empty((count, 2), np.int64)
+    for k in range(count):  # ascending in the second row, so that each place is the next free one
+        place = ends[pairs[k, 0]]
+        found[place, 0], found[place, 1] = pairs[k, 0], pairs[k, 1]
+        ends[pairs[k, 0]] += 1
+    return found
 
 
 def near_pairs_numpy(first: FloatArray, second: FloatArray, distance: float) -> IntArray:
