@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -165,15 +166,20 @@ def decoded_once() -> Iterator[None]:
 def read_once(recording: Sequence) -> Sequence:
     """The recording, whose packets are read, or simulated, when they are asked for first.
 
-    For several runs over the whole of a recording of tracks, which fits into memory.
+    For several runs over the whole of a recording of tracks, which fits into memory. Each of them
+    counts the faults that reading has found, and its own.
     """
-    read, kept = recording.packets, list[Packet]()
+    read, kept, counts = recording.packets, list[Packet](), Counter[str]()
 
     def packets(start_ns: int | None = None, end_ns: int | None = None) -> Iterator[Packet]:
         if start_ns is not None or end_ns is not None:
             return read(start_ns, end_ns)
+        recording.diagnostics.counts.clear()
         if not kept:
-            kept.extend(read())
+            kept.extend(list(read()))  # nothing is kept where it fails
+            counts.update(recording.diagnostics.counts)
+        else:
+            recording.diagnostics.counts.update(counts)
         return iter(kept)
 
     recording.packets = packets  # type: ignore[method-assign]

@@ -15,7 +15,7 @@ def main() -> None:
     gc.freeze()  # no collection looks at all that was imported
     gc.enable()
     do_given_task()
-    gc.freeze()  # nor does the one at the end of the interpreter
+    gc.freeze()  # nor does the one at the end of the interpreter: tasks close what they write
 
 
 if __name__ == "__main__":

@@ -33,7 +33,8 @@ def mixture_probabilities(
 
     Args:
         squares: (P,) squared offsets in the image, in standard deviations.
-        depths: (P,) absolute offsets of inverse depths, in standard deviations, ascending.
+        depths: (P,) absolute offsets of inverse depths, in standard deviations; ascending, for
+            their median.
         chances: (P,) probability that a false match has an offset in the image below a standard
             deviation.
         median: that of the absolute value of a standard normal variable.
@@ -79,7 +80,7 @@ def mixture_probabilities_numpy(
 
 
 @compiled()
-def _left(
+def _residual(
     J: FloatArray, offsets: FloatArray, p: int, drift: FloatArray, residuals: FloatArray
 ) -> float:
     """Squared length of what is left of the offset of match p, which is written to residuals."""
@@ -152,7 +153,7 @@ def drift_consensus(
         drift = _fitted(J, offsets, pairs[s], weights)
         hits = 0
         for p in range(count):
-            if _left(J, offsets, p, drift, residuals) < square:
+            if _residual(J, offsets, p, drift, residuals) < square:
                 hits += 1
             elif hits + count - p - 1 <= most:
                 break
@@ -160,7 +161,7 @@ def drift_consensus(
             best, most = drift, hits
     for turn in range(refinements + 1):
         for p in range(count):
-            chosen[p] = _left(J, offsets, p, best, residuals) < square
+            chosen[p] = _residual(J, offsets, p, best, residuals) < square
         if turn < refinements:
             best = _fitted(J, offsets, np.flatnonzero(chosen), weights)
     return chosen

@@ -52,7 +52,7 @@ def predict_motion(
     accel_biases: FloatArray,
     gravity: FloatArray,
 ) -> None:
-    """Fill in the motion at all times behind known ones, and up to the next known one.
+    """Fill in the motion at all times after known ones, and up to the next known one.
 
     Rate and specific force are constant in each step (Forster et al. 2017, eq. 30); the force has
     the direction of the middle of the step.
@@ -63,8 +63,8 @@ def predict_motion(
         forces: (S, 3) specific forces in them, m/s².
         steps: (N,) the first step after each time.
         known: (K,) times with a known motion, ascending, the first and the last time among them.
-        rotations: (N, 3, 3) world_R_body; those at known times are given, but for the first they
-            become what is predicted from the known time before.
+        rotations: (N, 3, 3) world_R_body. At known times they are given; on return all but the
+            first are what is predicted from the known time before.
         positions: (N, 3), m, likewise.
         velocities: (N, 3), m/s, likewise.
         gyro_biases: (K, 3) from each known time on, rad/s.

@@ -36,30 +36,32 @@ def _strips(points: FloatArray, distance: float) -> tuple[float, float, int]:
     for j in range(len(points)):
         if math.isfinite(points[j, 0]):
             left, right = min(left, points[j, 0]), max(right, points[j, 0])
-    if not left <= right:
+    extent = right - left
+    if not (left <= right and math.isfinite(extent) and math.isfinite(distance)):
         return 0.0, 1.0, 0
-    width = max(distance, (right - left) / len(points), 1e-300)
-    return left, width, math.floor((right - left) / width) + 1
+    # wider by more than what is rounded where a point is looked for
+    width = max(1.000001 * distance, extent / len(points), 1e-300)
+    return left, width, math.floor(extent / width) + 1
 
 
 @compiled()
 def _strip(x: float, left: float, width: float, strips: int) -> int:
-    """The strip of a coordinate; -2 and one or two more than there are for all that are far off."""
+    """The strip of a coordinate; outside of -2 to `strips` + 1 it is the nearest of these."""
     return math.floor(min(max((x - left) / width, -2.0), strips + 1.0))
 
 
 @compiled()
-def _longer(pairs: IntArray, count: int) -> IntArray:
-    """The first of the rows in an array of another length."""
-    longer = np.empty((count, 2), np.int64)
+def _resized(pairs: IntArray, count: int) -> IntArray:
+    """The rows, as many as there is room for, in an array of another length."""
+    rows = np.empty((count, 2), np.int64)
     for k in range(min(count, len(pairs))):
-        longer[k, 0], longer[k, 1] = pairs[k, 0], pairs[k, 1]
-    return longer
+        rows[k, 0], rows[k, 1] = pairs[k, 0], pairs[k, 1]
+    return rows
 
 
 @compiled("i8[:, ::1](f8[:, ::1], f8[:, ::1], f8)")
 def near_pairs(first: FloatArray, second: FloatArray, distance: float) -> IntArray:
-    """Which points are at most so far apart; none that is not finite.
+    """Which points are at most so far apart; none that is not finite, or beyond 1e307.
 
     Args:
         first: (N, 2).
@@ -92,7 +94,7 @@ def near_pairs(first: FloatArray, second: FloatArray, distance: float) -> IntArr
             dx, dy = second[j, 0] - first[i, 0], second[j, 1] - first[i, 1]
             if dx * dx + dy * dy <= limit:
                 if count == len(pairs):
-                    pairs = _longer(pairs, 2 * count)
+                    pairs = _resized(pairs, 2 * count)
                 pairs[count, 0], pairs[count, 1] = i, j
                 ends[i + 1] += 1
                 count += 1

@@ -104,7 +104,7 @@ class StandstillDetector:
         """Decide whether images and IMU agree that nothing has moved over the window.
 
         Args:
-            imu: samples up to the frame.
+            imu: samples up to the frame at least.
             stamp_ns: time of the frame on the clock of the IMU.
             frame: compared by the features of its first camera.
 

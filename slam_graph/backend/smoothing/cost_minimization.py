@@ -22,11 +22,12 @@ _FIRST_DAMPING = 1e-5
 _MAX_DAMPING = 1e5
 """Steps end when the damping exceeds this."""
 _SMALL_STEP = 0.02
-"""A factor is kept after a step that lowers the cost by less than this part of it,"""
+"""A factor is kept after a step that lowers the cost by less than this part of it."""
 _AGREEMENT = 0.1
-"""or by what was predicted but for this part, as it is hardly another one then;"""
+"""A new factor is also kept if its step lowers the cost by what it predicts but for this part."""
 _CONTRACTION = 0.2
-"""and by less than this part of what the step before did."""
+"""An earlier factor is kept only as long as each step lowers the cost by less than this part of
+what the step before did."""
 _CAUTION = 0.01
 """Steps by an earlier factor converge linearly: in the end their decrease must be less by this."""
 
@@ -69,7 +70,8 @@ def minimized(
                     factor, damped = linear.factor(damping), damping
                 step = factor.step(linear)
                 moved = estimates.moved(step)
-                after = cost.value(moved)
+                # an earlier factor that predicts more than all of the cost is not that of this one
+                after = cost.value(moved) if fresh or step.predicted <= value else math.nan
             except (np.linalg.LinAlgError, RuntimeError):
                 after = math.nan
             if after <= value or damping > _MAX_DAMPING:

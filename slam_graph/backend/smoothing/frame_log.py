@@ -188,20 +188,23 @@ class FrameLog:
         return np.array(self._noise, dtype=np.float64).reshape(-1, 2)
 
     def samples(self, first: int, stop: int, rig: Rig) -> ImuData:
-        """The samples of the IMU around the frames `first` to `stop - 1`, and 1 s before them."""
+        """The samples of the IMU from 1 s before the frame `first` to the frame `stop - 1`.
+
+        The last one is the first at or after the exposure of the last row of that frame.
+        """
         clocks = self.clock_changes
-        # samples of a clock that became later are of frames before, of one that became earlier
-        # of frames behind
-        begin_ns = self._frames[first] - _HISTORY_NS
+        # a sample of a clock that became later belongs to an earlier frame than its stamp says, and
+        # one of a clock that became earlier to a later frame
+        ahead_s = replace(rig.shifted(clocks.latest_s), has_imu=True).end_offset_s
+        begin_ns = self._frames[first] + min(0, round(rig.pose_offset_s * 1e9)) - _HISTORY_NS
         if clocks.earliest_s < 0.0:
             begin_ns += round(clocks.earliest_s * 1e9) - _AROUND_NS
-        ahead_s = replace(rig.shifted(clocks.latest_s), has_imu=True).end_offset_s
         end_ns = self._frames[stop - 1] + max(0, round(ahead_s * 1e9))
         blocks: list[ImuData] = []
         for block in self._recorder.recorded(_Silent()).imu_blocks(begin_ns):
-            beyond = int(np.searchsorted(block.stamps_ns, end_ns)) + 1
-            blocks.append(block[:beyond])
-            if beyond <= len(block):
+            count = int(np.searchsorted(block.stamps_ns, end_ns)) + 1
+            blocks.append(block[:count])
+            if count <= len(block):
                 break
         return clocks.corrected(ImuData.concatenate(blocks))
 

@@ -65,8 +65,8 @@ def consistent_matches(
     alarms) must be small (a contrario: Moisan & Stival 2004).
 
     Args:
-        J: (P, 2, 4) Jacobians of the offsets by the drift.
-        offsets: (P, 2) in standard deviations.
+        J: (P, m, 4) Jacobians of the offsets by the drift.
+        offsets: (P, m) in standard deviations.
         limit: largest residual of a consistent match, in standard deviations.
         chance: probability that a false match has an offset shorter than a standard deviation.
         tests: number of sets of matches that are tested.
@@ -93,6 +93,8 @@ def _largest_set(
     J: FloatArray, offsets: FloatArray, limit: float, rng: np.random.Generator
 ) -> tuple[BoolArray, FloatArray]:
     """The largest set (P,) consistent with one drift, and what is left (P, m) of all offsets."""
+    if len(J) < 2:  # which any drift would fit
+        return np.zeros(len(J), np.bool_), offsets
     residuals = np.empty(offsets.shape)
     consistent = drift_consensus(
         np.ascontiguousarray(J),

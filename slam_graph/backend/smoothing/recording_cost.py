@@ -65,7 +65,8 @@ class Step:
     Attributes:
         states: (K, 15) increments of the keyframe states.
         points: (J, 3) of the features.
-        predicted: by how much the quadratic model says that the cost decreases.
+        predicted: by how much the cost decreases by the model whose factor was used, with its
+            damping, and with the curvature of where it was made.
         fixes: (n,) of clock (s) and lever arm (m).
     """
 
@@ -248,7 +249,7 @@ class Factor:
         if eliminated is not None:
             shared = eliminated.step(by_fixes, states[:, :6])
         points = self.features.points(t, states[:, :6])
-        # the step δ solves H δ = g, so that the model gᵀ δ - ½ δᵀ H δ is ½ gᵀ δ
+        # with H of the factor, damped, H δ = g, so that the model gᵀ δ - ½ δᵀ H δ is ½ gᵀ δ
         predicted = 0.5 * float(np.sum(gradient * states) + np.sum(by_point * points))
         return Step(states, points, predicted + 0.5 * float(by_fixes @ shared), shared)
 

@@ -69,6 +69,7 @@ class TrackRecorder:
         self._counts = {"frames": 0, "imu_samples": 0, "features": 0}
         self._aiding: list[AidingData] = []
         self._latest_ns: int | None = None
+        self._recorded: layout.TrackRecordingSequence | None = None
         self._descriptor_bytes: int | None = None
         self._depth_camera = None if rig.depth is None else rig.depth.camera
         self._record = layout.frame_record(len(rig.cameras))
@@ -110,7 +111,7 @@ class TrackRecorder:
             shutil.rmtree(self._folder, ignore_errors=True)
 
     def recorded(self, diagnostics: Diagnostics) -> layout.TrackRecordingSequence:
-        """What was recorded, once the recorder is closed.
+        """What was recorded, once the recorder is closed. It is opened once.
 
         Args:
             diagnostics: where faults are counted as it is read.
@@ -118,8 +119,10 @@ class TrackRecorder:
         Raises:
             DataError: if a file is missing or cut.
         """
-        options = ReaderOptions(diagnostics=diagnostics)
-        return layout.TrackRecordingSequence(self.path, options)
+        if self._recorded is None:
+            options = ReaderOptions(diagnostics=diagnostics)
+            self._recorded = layout.TrackRecordingSequence(self.path, options)
+        return self._recorded
 
     def write(self, imu: ImuData, frame: FeatureFrame, aiding: AidingData | None = None) -> None:
         """Append a packet.

@@ -260,6 +260,8 @@ class TrackRecordingSequence(RecordedSequence):
     def features(self, first_ns: int, last_ns: int) -> tuple[IntArray, NDArray[np.void]]:
         """All features of some frames at once, as they were recorded.
 
+        Those of all cameras, with the calibration of the recording, whatever it was opened with.
+
         Args:
             first_ns: time of the first of these frames.
             last_ns: time of the last one.
