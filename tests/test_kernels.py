@@ -304,28 +304,32 @@ def test_block_sums() -> None:
     assert np.any(found[0] == 0.0)
 
 
-@pytest.mark.parametrize("covariances", [0, 4])
-def test_motion_steps(covariances: int) -> None:
+@pytest.mark.parametrize(("covariances", "largest"), [(0, 0.5), (4, 0.0), (4, 1e3)])
+def test_motion_steps(covariances: int, largest: float) -> None:
     rng = np.random.default_rng(9)
     r, _, by_point, _, _, starts = tracks(rng, 0)
     shares, since = rng.normal(size=(len(r), 3)), rng.uniform(-0.5, 0.0, len(r))
-    x, before = rng.normal(size=(2, 4, 12))
-    given = by_point, r, shares, since, starts, x, before, rng.uniform(0.1, 1.0, 12)
+    in_camera, (x, before) = rng.normal(size=(len(r), 3)), rng.normal(size=(2, 4, 12))
+    prior = starts, before, rng.uniform(0.1, 1.0, 12)
+    given = by_point, r, in_camera, shares, since, *prior, 0.7, 0.5, largest
     found = []
     for kernel in motion_steps, motion_steps_numpy:
-        found.append([np.empty(4), np.empty((4, 12)), np.empty((covariances, 3, 3))])
+        covariance = np.empty((covariances, 3, 3))
+        found.append([x.copy(), np.empty((len(r), 3)), np.empty(4), covariance])
         kernel(*given, *found[-1])
     assert all(same(a, b) for a, b in zip(*found, strict=True))
+    assert np.array_equal(found[0][0], x) == (largest == 0.0)
 
 
 def test_motion_steps_where_rounding_makes_the_equations_indefinite() -> None:
     """A point all but in a camera: 1e20 in some directions and 1e-4 in others."""
     rng = np.random.default_rng(10)
     r, _, by_point, _, _, starts = tracks(rng, 0)
-    by_point = 1e10 * np.ones_like(by_point)
+    by_point, in_camera = 1e10 * np.ones_like(by_point), np.ones((len(r), 3))
     shares, since, x = np.ones((len(r), 3)), np.full(len(r), -0.1), np.zeros((4, 12))
-    found = np.empty(4), np.empty((4, 12)), np.empty((4, 3, 3))
-    motion_steps(by_point, r, shares, since, starts, x, x, np.full(12, 1e-4), *found)
+    found = x, np.empty((len(r), 3)), np.empty(4), np.empty((4, 3, 3))
+    prior = starts, x.copy(), np.full(12, 1e-4)
+    motion_steps(by_point, r, in_camera, shares, since, *prior, 1.0, 0.1, 0.5, *found)
     assert all(np.isfinite(values).all() for values in found)
 
 

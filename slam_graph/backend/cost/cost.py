@@ -269,7 +269,9 @@ class Cost:
         Ab = np.zeros((sum(factor.dim() for factor in self.factors), layout.size + 1), order="F")
         for factor in self.factors:
             assert isinstance(factor, gtsam.NoiseModelFactor)
-            jacobian = gtsam.JacobianFactor(factor.linearize(first))
+            jacobian = factor.linearize(first)
+            if not isinstance(jacobian, gtsam.JacobianFactor):
+                jacobian = gtsam.JacobianFactor(jacobian)
             A, _ = jacobian.jacobian()
             rows = slice(end, end + len(A))
             Ab[rows, layout.indices(jacobian.keys())] = A

@@ -305,7 +305,9 @@ class FeatureTracks:
         """The features that any camera saw in one frame, ascending."""
         return ascending_union(self._ids[self._frames == index])
 
-    def parallax(self, before: int, after: int, turns: Sequence[FloatArray]) -> FloatArray:
+    def parallax(
+        self, before: int, after: int, turns: Sequence[FloatArray], least: float = 0.0
+    ) -> FloatArray:
         """Angles (N,) in rad between the rays to features that one camera sees in two frames.
 
         It is the first camera that sees any feature in both, so another one than the first of the
@@ -315,6 +317,7 @@ class FeatureTracks:
             before: a frame.
             after: another.
             turns: for each camera its rotation (3, 3) from the first frame to the second.
+            least: there are none if it sees fewer than so many.
         """
         for camera, turn in enumerate(turns):
             mine = self._cameras == camera
@@ -322,6 +325,8 @@ class FeatureTracks:
             i = i[is_in(self._ids[i], self._ids[j])]
             if len(i) == 0:
                 continue
+            if len(i) < least:
+                break
             j = j[self._ids[j].searchsorted(self._ids[i])]
             rays = np.ones((2, len(i), 3))
             rays[:, :, :2] = self._places[1, i], self._places[1, j]

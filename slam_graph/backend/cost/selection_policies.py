@@ -130,8 +130,9 @@ def _is_new(
     both = [keyframe, frame]
     (before, after), _ = rig.when_taken(both, *window.state.poses(both))
     turns = [(after @ R).T @ before @ R for R in rig.body_R_camera]
-    angles = window.tracks.parallax(keyframe, frame, turns)
-    if len(angles) < policy.keyframe_overlap * len(window.tracks.ids_in(frame)):
+    least = policy.keyframe_overlap * len(window.tracks.ids_in(frame))
+    angles = window.tracks.parallax(keyframe, frame, turns, least)
+    if len(angles) < least:
         return True
     return bool(np.median(angles) > policy.keyframe_parallax_rad) if len(angles) else False
 

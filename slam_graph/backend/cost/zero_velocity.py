@@ -75,7 +75,8 @@ class StandstillDetector:
         dynamic: ids (N,) of dynamic features, ascending: those that moved while the platform did
             not, or that were reported by `add_dynamic`. A feature stays dynamic while it is tracked
             by the first camera.
-        noise_px: standard deviation of a coordinate of a feature over the window; 0 if not known.
+        noise_px: standard deviation of a coordinate of a feature over the window; 0 if not known,
+            and where the detector is not enabled.
     """
 
     def __init__(
@@ -116,7 +117,8 @@ class StandstillDetector:
         self._recent.append((stamp_ns, _by_id(frame.cameras[0])))
         while len(self._recent) > 1 and self._recent[1][0] <= start_ns:
             self._recent.popleft()
-        self._measure_noise(start_ns)
+        if self._enabled:
+            self._measure_noise(start_ns)
         velocity_sigma = None
         if self._enabled and self._recent[0][0] <= start_ns and self._images_are_still():
             velocity_sigma = self._sigma_by_imu(imu, start_ns, stamp_ns)

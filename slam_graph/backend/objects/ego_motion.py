@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import gtsam
 import numpy as np
@@ -65,6 +66,16 @@ class EgoMotion:
             now_ns: stamp of the frame.
             offset_ns: from stamps of frames to the clock of the samples.
         """
+        known = self._known_samples.get((now_ns, offset_ns))  # every object asks for them
+        if known is None:
+            known = self._known_samples[now_ns, offset_ns] = self._samples(now_ns, offset_ns)
+        return known
+
+    @cached_property
+    def _known_samples(self) -> dict[tuple[int, int], ImuData]:
+        return {}
+
+    def _samples(self, now_ns: int, offset_ns: int) -> ImuData:
         row = self.stamps_ns.index(now_ns)
         if row == 0:
             return ImuData.empty()

@@ -23,6 +23,8 @@ from slam_graph.backend.objects.track_window import TrackWindow, squared_errors
 
 _ROUNDS = 3
 """Times that poses and points are fitted to one another."""
+CLEARLY = 4.0
+"""Factor on the margin from which the mirror image is clearly worse."""
 _LEAST_FRAMES = 3
 """Frames that must have seen a track."""
 _LEAST_POINTS = 4
@@ -58,14 +60,22 @@ class MirrorMotion:
         if len(fit.ids) < _LEAST_POINTS:
             return 0.0
         mirrored = _mirrored(cameras, fit.points)
-        best = self._refined(tracks, mirrored, self._fit(tracks, mirrored))
+        clear = fit.squares + CLEARLY * MARGIN
+        best = self._refined(tracks, mirrored, self._fit(tracks, mirrored), clear)
         if best - fit.squares > MARGIN:
             return best - fit.squares
         return best - self._refined(tracks, cameras, fit)
 
-    def _refined(self, tracks: _Tracks, cameras: list[gtsam.Pose3], fit: _Fit) -> float:
-        """Least squared errors near some poses of the first camera."""
-        for _ in range(_ROUNDS):
+    def _refined(
+        self, tracks: _Tracks, cameras: list[gtsam.Pose3], fit: _Fit, clear: float = np.inf
+    ) -> float:
+        """Least squared errors near some poses of the first camera.
+
+        Or those of an earlier round, where they fall by less from round to round and would stay
+        above `clear` even if all rounds that are left lowered them as much as the last one did.
+        """
+        gain = 0.0
+        for left in reversed(range(_ROUNDS)):
             cameras = [
                 _resected(pose, fit.ids, fit.points, *rays)
                 for pose, rays in zip(cameras, tracks.rays, strict=True)
@@ -73,7 +83,9 @@ class MirrorMotion:
             again = self._fit(tracks, cameras)
             if again.squares >= fit.squares:
                 break
-            fit = again
+            before, gain, fit = gain, fit.squares - again.squares, again
+            if gain < before and fit.squares - left * gain > clear:
+                break
         return fit.squares
 
     def _fit(self, tracks: _Tracks, cameras: list[gtsam.Pose3]) -> _Fit:

@@ -99,9 +99,9 @@ class MotionTest:
     @cached_property
     def probabilities(self) -> FloatArray:
         """(J,) that each moves; not every test is asked for them."""
-        return _probabilities(self.velocities, self.covariances)
+        return _probabilities(self.velocities, self.covariances, self.statistics)
 
-    @property
+    @cached_property
     def moves(self) -> BoolArray:
         """(J,) whose verdict is MOVING or WRONG."""
         return np.asarray((self.verdicts == Verdict.MOVING) | (self.verdicts == Verdict.WRONG))
@@ -147,9 +147,7 @@ def judge_tracks(
         + ego.velocity_covariance
         + arm @ ego.rate_covariance @ arm.transpose(0, 2, 1)
     )
-    statistics = np.einsum(
-        "ji,ji->j", velocities, np.linalg.solve(Sigma, velocities[:, :, None])[:, :, 0]
-    )
+    statistics = _statistics(velocities, Sigma)
     dof = np.maximum(2 * obs.counts - 6, 1)
     verdicts = np.full(count, int(Verdict.UNKNOWN))
     largest = np.sqrt(np.linalg.eigvalsh(Sigma)[:, -1])
@@ -211,26 +209,19 @@ def _fit(
     """Position now and velocity (J, 3), its covariance (J, 3, 3), squared errors (J,) over σ²."""
     J, N = len(obs.ids), len(obs)
     alone = replace(obs, feature=np.arange(N))  # every observation has a point of its own
-    since, starts = seconds[obs.frame], obs.starts
+    since, reach = seconds[obs.frame], float(-seconds.min())
     x = np.hstack([points, np.zeros((J, 3 + _NUISANCES))])
-    before, information = x.copy(), _PRIOR_SIGMAS**-2.0
+    prior = obs.starts, x.copy(), _PRIOR_SIGMAS**-2.0
     shares = _shares(obs, since) / sigma_px
-    squares, shifts, covariances = np.empty(J), np.empty_like(x), np.empty((J, 3, 3))
+    seen, squares, covariances = points[obs.feature], np.empty(J), np.empty((J, 3, 3))
     for step in range(_STEPS + 1):
-        own = x[obs.feature]
-        seen = own[:, :3] + since[:, None] * own[:, 3:6]
+        last = step == _STEPS  # tells how well the tracks are known
         at = Geometry(rotations, positions, seen)
         views = rig.views(alone, at)
-        residuals = (obs.pixels - views.pixels) / sigma_px
-        by_point = rig.derivatives(alone, at, views)[1] / sigma_px
-        system = by_point, residuals, shares, since, starts, x, before, information
-        wanted = covariances[:0] if step < _STEPS else covariances
-        motion_steps(*system, squares, shifts, wanted)
-        if step < _STEPS:
-            depth = np.minimum.reduceat(np.abs(views.in_camera[:, 2]), starts[:-1])
-            moved = np.linalg.norm(shifts[:, :3], axis=1)
-            moved += np.linalg.norm(shifts[:, 3:6], axis=1) * float(-seconds.min())
-            x = x + shifts * np.minimum(1.0, _MAX_STEP * depth / np.maximum(moved, 1e-9))[:, None]
+        by_point = rig.derivatives(alone, at, views)[1]
+        system = by_point, obs.pixels - views.pixels, views.in_camera, shares, since, *prior
+        limits = sigma_px, reach, 0.0 if last else _MAX_STEP
+        motion_steps(*system, *limits, x, seen, squares, covariances if last else covariances[:0])
     return x[:, :3], x[:, 3:6], covariances, squares
 
 
@@ -240,17 +231,23 @@ def _shares(obs: Observations, since: FloatArray) -> FloatArray:
     return np.stack([second, (1.0 - second) * since, second * since], axis=1)
 
 
-def _probabilities(velocities: FloatArray, Sigma: FloatArray) -> FloatArray:
+def _probabilities(velocities: FloatArray, Sigma: FloatArray, statistics: FloatArray) -> FloatArray:
     """(J,) that a track moves, by the Bayes factor of the two hypotheses."""
     wide = Sigma + _OBJECT_SPEED**2 * np.eye(3)
-    u = velocities[:, :, None]
-
-    def log_density(P: FloatArray) -> FloatArray:
-        squares = np.einsum("ji,ji->j", velocities, np.linalg.solve(P, u)[:, :, 0])
-        return np.asarray(-0.5 * (squares + np.linalg.slogdet(P)[1]))
-
-    log_odds = np.log(_PRIOR_ODDS) + log_density(wide) - log_density(Sigma)
+    moving = _log_density(wide, _statistics(velocities, wide))
+    log_odds = np.log(_PRIOR_ODDS) + moving - _log_density(Sigma, statistics)
     return np.asarray(1.0 / (1.0 + np.exp(-np.clip(log_odds, -50.0, 50.0))))
+
+
+def _statistics(velocities: FloatArray, P: FloatArray) -> FloatArray:
+    """(J,) uᵀ P⁻¹ u."""
+    solved = np.linalg.solve(P, velocities[:, :, None])[:, :, 0]
+    return np.asarray(np.einsum("ji,ji->j", velocities, solved))
+
+
+def _log_density(P: FloatArray, squares: FloatArray) -> FloatArray:
+    """Logarithms (J,) of the densities of normal distributions but for a constant."""
+    return np.asarray(-0.5 * (squares + np.linalg.slogdet(P)[1]))
 
 
 def _cross_matrices(vectors: FloatArray) -> FloatArray:

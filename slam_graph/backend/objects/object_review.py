@@ -79,11 +79,10 @@ class ObjectReview:
     def of(self, item: TrackedObject) -> list[Part]:
         """What an object is: nothing if it is as it is known, one part to begin again, or two."""
         least = self._config.min_points
-        # an estimate that begins anew costs most; where the other cannot fill the window, it is
-        # not made
-        if not self._fill_the_window([s for s in self._window.stamps_ns if s in item.poses]):
-            return []
         members = item.taken
+        # an estimate that begins anew costs most, and is made only where it can be better
+        if not self._in_doubt(item, members):
+            return []
         anew = self._begun(members)
         if anew is None:
             return []
@@ -94,22 +93,33 @@ class ObjectReview:
         best, part = self._total(members, anew.motion, stamps), anew
         limit = float(chdtri(6 * (len(stamps) - 1), self._config.false_alarm))
         halves: list[Part] = []
+        enough = limit + _LABEL * len(members)
         if (
             item.label == 0  # masks tell objects apart
             and len(members) >= 2 * least
             and min(current, best) > self._expected(members, stamps)
         ):
-            halves = self._halves(members, least)
+            halves = self._halves(members, least, min(current, best) - enough)
         for half in halves:
             squares = self._total(members, half.motion, stamps)
             if squares < best:
                 best, part = squares, half
         if halves:
             apart = sum(self._total(half.members, half.motion, stamps) for half in halves)
-            if min(current, best) - apart > limit + _LABEL * len(members):
+            if min(current, best) - apart > enough:
                 return halves
         again = float(chdtri(6 * (len(stamps) - 1), _AGAIN))
         return [Part(item.members, part.motion)] if current - best > again else []
+
+    def _in_doubt(self, item: TrackedObject, members: IntArray) -> bool:
+        """Whether an estimate fills the window, and its errors are larger than those of one body.
+
+        Where they are no larger, no new estimate was so much better that it was taken.
+        """
+        stamps = [stamp for stamp in self._window.stamps_ns if stamp in item.poses]
+        if not self._fill_the_window(stamps):
+            return False
+        return self._total(members, item, stamps) > self._expected(members, stamps)
 
     def _fill_the_window(self, stamps: list[int]) -> bool:
         """Whether a motion is known over the whole window; earlier too many motions fit."""
@@ -121,12 +131,19 @@ class ObjectReview:
     def _expected(self, members: IntArray, stamps: list[int]) -> float:
         """Sum of the squared errors of one body; larger ones are found in one of six frames."""
         length = np.isin(self._window.stamps_ns, stamps)
-        obs = self._window.observations(members, 3, stamps)
+        obs = self._window.observations(members, _LEAST_FRAMES, stamps)
         dof = float(np.sum(2 * obs.counts - 3)) - 6 * (np.count_nonzero(length) - 1)
         return dof + float(np.sqrt(2.0 * max(dof, 1.0)))
 
-    def _halves(self, members: IntArray, least: int) -> list[Part]:
-        """Two parts of some tracks, each with a motion of its own; none if one is too small."""
+    def _halves(self, members: IntArray, least: int, most: float) -> list[Part]:
+        """Two parts of some tracks, each with a motion of its own; none if one is too small.
+
+        Args:
+            members: (N,) ids of the tracks, ascending.
+            least: fewest of a part.
+            most: squared errors of both above which they are not told apart. Tracks do not go over
+                where the errors are above that by more than what a motion takes.
+        """
         first = _one_side(self._window.pixels(members))
         halves: list[Part] = []
         for _ in range(1 + _ROUNDS):
@@ -139,7 +156,8 @@ class ObjectReview:
                 return []
             squares = [self._squares(members, half.motion.poses) for half in halves]
             nearer = squares[0] <= squares[1]
-            if np.array_equal(nearer, first):
+            together = float(np.minimum(*squares).sum()) - 6 * (len(halves[0].motion.poses) - 1)
+            if np.array_equal(nearer, first) or together > most:
                 break
             first = nearer
         return halves

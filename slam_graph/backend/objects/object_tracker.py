@@ -13,11 +13,11 @@ import gtsam
 import numpy as np
 from scipy.special import chdtri
 
-from slam_graph.arrays import FloatArray, IntArray, ascending_union
+from slam_graph.arrays import FloatArray, IntArray, ascending_union, median
 from slam_graph.backend.backend_config import BackendConfig
 from slam_graph.backend.cost.feature_tracks import is_in
 from slam_graph.backend.objects.ego_motion import EgoMotion
-from slam_graph.backend.objects.mirror_motion import MirrorMotion
+from slam_graph.backend.objects.mirror_motion import CLEARLY, MirrorMotion
 from slam_graph.backend.objects.motion_segmentation import rigid_groups
 from slam_graph.backend.objects.motion_test import MotionTest, Verdict, judge_tracks
 from slam_graph.backend.objects.object_frame import ObjectFrame
@@ -49,8 +49,9 @@ _TWO_MOTIONS = 0.25
 """Share of the tracks of an object that move in its frame, from which it is two objects."""
 _REVIEWS = (3, 6, 10)
 """Frames of an object after which it is reviewed; later each time as many as the last one."""
-_MIRRORED = 2
-"""Frames between two comparisons with the mirror image, once it was ruled out."""
+_MIRRORED, _CLEARLY_MIRRORED = 2, 5
+"""Frames between two comparisons with the mirror image, once it was ruled out; and once it was
+clearly: the window then has hardly a frame that was compared."""
 _PAUSE = 5
 """Least frames between two reviews of an object."""
 _BADLY = 3.0
@@ -194,9 +195,11 @@ class ObjectTracker:
         """See whether tracks tell the motion of their object from its mirror image."""
         mirror = MirrorMotion(self._window, sigma_px)
         for item in self.objects:
-            if item.unique and item.frames % _MIRRORED:
+            if item.unique and item.frames < item.compared_next:
                 continue
             worse = mirror.worse(item.members, item.poses)
+            clearly = worse > CLEARLY * MARGIN
+            item.compared_next = item.frames + (_CLEARLY_MIRRORED if clearly else _MIRRORED)
             if abs(worse) > MARGIN:
                 item.unique = worse > 0
             if worse < -MARGIN:  # one that begins now finds either of the two
@@ -235,8 +238,8 @@ class ObjectTracker:
         static = dict(zip(ego.stamps_ns, ego.poses, strict=True))
         _, squares, dof = self._window.misfit(test.ids[~test.moves], static, sigma_px)
         if len(dof) >= _ENOUGH:
-            median = float(np.median(squares / chdtri(dof, 0.5)))
-            ratio = float(np.clip(median, _LEAST_NOISE**2, 1.0))
+            middle = float(median(squares / chdtri(dof, 0.5)))
+            ratio = float(np.clip(middle, _LEAST_NOISE**2, 1.0))
             self._noise_frames += 1
             weight = max(_NEWS, 1.0 / (1.0 + self._noise_frames))
             self._noise += weight * (float(np.sqrt(ratio)) - self._noise)

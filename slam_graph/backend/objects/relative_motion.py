@@ -104,7 +104,7 @@ class RelativeMotion:
         self._length_ns = round(length_s * 1e9)
         self._offset_ns = round(rig.pose_offset_s * 1e9)
         self.known: IntArray = np.zeros(0, np.int64)  # ids of all features so far, ascending
-        self._taken_ns = 0  # motion of the platform after this has not been added
+        self.taken_ns = 0  # motion of the platform after this has not been added
         self._frames: dict[int, int] = {}  # index in the estimator of the frame with a stamp
         self.poses: dict[int, gtsam.Pose3] = {}  # object_T_body by stamp, as known now
 
@@ -178,11 +178,11 @@ class RelativeMotion:
 
     def _add_motion(self, now_ns: int, ego: EgoMotion) -> None:
         """Add the motion of the platform since the last frame that was taken."""
-        since = self._taken_ns or now_ns - 1
+        since = self.taken_ns or now_ns - 1
         for stamp in ego.stamps_ns:
             if since < stamp <= now_ns:
                 self._estimator.add_motion(ego.samples(stamp, self._offset_ns))
-        self._taken_ns = now_ns
+        self.taken_ns = now_ns
 
     def assume_pixel_noise(self, sigma_px: float) -> None:
         """Take observations for so noisy from now on."""

@@ -19,7 +19,7 @@ from slam_graph.backend.cost.gating import threshold
 from slam_graph.backend.objects.ego_motion import EgoMotion
 from slam_graph.backend.objects.motion_test import MotionTest, Verdict
 from slam_graph.backend.objects.track_labels import TrackLabels
-from slam_graph.backend.objects.track_window import TrackWindow
+from slam_graph.backend.objects.track_window import TrackWindow, quantile
 from slam_graph.backend.objects.tracked_object import TrackedObject
 
 MARGIN = 12.0
@@ -161,7 +161,7 @@ def _scale(squares: FloatArray, dof: IntArray) -> float:
     """Squared errors of the tracks that fit best, over what is expected; at least 1."""
     if len(dof) == 0:
         return 1.0
-    return max(1.0, float(np.quantile(squares / dof, _BEST)))
+    return max(1.0, quantile(squares / dof, _BEST))
 
 
 def _for(ids: IntArray, found: IntArray, values: FloatArray | IntArray) -> FloatArray:

@@ -12,7 +12,7 @@ import numpy as np
 
 from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.backend.backend_config import BackendConfig
-from slam_graph.backend.cost.feature_tracks import FeatureTracks, Observations
+from slam_graph.backend.cost.feature_tracks import FeatureTracks, Observations, is_in
 from slam_graph.backend.cost.reprojection import RigProjection
 from slam_graph.backend.cost.triangulation import Triangulation, triangulate
 from slam_graph.backend.objects.ego_motion import pose_arrays
@@ -39,6 +39,7 @@ class TrackWindow:
         self._tracks = FeatureTracks()
         self._numbers: deque[int] = deque()  # of the frames in the tracks
         self._count = 0
+        self._known: dict[tuple[int, ...], Observations] = {}  # of what the last frame saw
 
     @property
     def stamps_ns(self) -> list[int]:
@@ -53,6 +54,7 @@ class TrackWindow:
     def add(self, frame: FeatureFrame, since_ns: int) -> None:
         """Add a frame; forget those before a time, and the last one if it is near to the others."""
         self._tracks.add(self._count, frame)
+        self._known.clear()
         self.frames.append(frame)
         self._numbers.append(self._count)
         self._count += 1
@@ -76,10 +78,19 @@ class TrackWindow:
         """Observations in some frames of the features (ascending ids) that enough of them saw.
 
         Args:
-            ids: of the features.
+            ids: of the features; those that the last frame did not see are left out.
             least: how many frames must have seen a feature.
             stamps_ns: of the frames; `frame` and `frames` of the result are numbers among them.
         """
+        asked = least, *stamps_ns
+        known = self._known.get(asked)  # all tests of a frame ask for the same frames
+        if known is None:
+            known = self._known[asked] = self._observations(self.seen, least, stamps_ns)
+        obs = known.subset(is_in(known.ids, ids))
+        idle = not np.bincount(obs.frame, minlength=len(obs.frames)).all()
+        return obs.without_idle_frames() if idle else obs
+
+    def _observations(self, ids: IntArray, least: int, stamps_ns: list[int]) -> Observations:
         here = dict(zip(self.stamps_ns, self._numbers, strict=True))
         chosen = [here[stamp] for stamp in stamps_ns if stamp in here]
         obs = self._tracks.observations(ids, chosen)
@@ -132,3 +143,16 @@ def squared_errors(obs: Observations, found: Triangulation, sigma_px: float) -> 
     """(J,) squared errors of features over σ²; infinite for those without a position."""
     squares = obs.counts * (found.reprojection_px / sigma_px) ** 2
     return np.asarray(np.where(np.isfinite(squares), squares, np.inf))
+
+
+def quantile(values: FloatArray, share: float) -> float:
+    """A quantile of some values (N,), N at least one; NumPy's takes many times as long.
+
+    Linear between values, with NumPy's roundings.
+    """
+    ascending = np.sort(values)
+    place = share * (len(ascending) - 1)
+    row = int(place)
+    a, b = float(ascending[row]), float(ascending[min(row + 1, len(ascending) - 1)])
+    part = place - row
+    return b - (b - a) * (1.0 - part) if part >= 0.5 else a + (b - a) * part

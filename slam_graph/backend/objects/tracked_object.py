@@ -11,13 +11,13 @@ import gtsam
 import numpy as np
 from scipy.special import chdtri
 
-from slam_graph.arrays import FloatArray, IntArray
+from slam_graph.arrays import FloatArray, IntArray, median
 from slam_graph.backend.cost.feature_tracks import is_in
 from slam_graph.backend.objects.ego_motion import EgoMotion
 from slam_graph.backend.objects.object_state import ObjectMotion, ObjectState
 from slam_graph.backend.objects.objects_config import ObjectsConfig
 from slam_graph.backend.objects.relative_motion import RelativeMotion
-from slam_graph.backend.objects.track_window import TrackWindow
+from slam_graph.backend.objects.track_window import TrackWindow, quantile
 
 _MAX_REJECTIONS = 2
 """A track that the gate rejects so often within the frames of the window is not of the object."""
@@ -52,6 +52,7 @@ class TrackedObject:
         members: as above, now.
         frames: number of frames with a state.
         reviewed: how many of them it had when it was reviewed last.
+        compared_next: how many it has when it is compared with its mirror image again.
         seen_ns: time of the last frame with a state.
         moving: whether it is known to move.
         standing: whether it was seen to stand since it moved last.
@@ -69,7 +70,7 @@ class TrackedObject:
         config: ObjectsConfig,
     ) -> None:
         self.number, self.label, self.members = number, label, members
-        self.frames, self.reviewed = 0, 0
+        self.frames, self.reviewed, self.compared_next = 0, 0, 0
         self.moving, self.standing = False, False
         self.reported, self.unique = False, False
         self.seen_ns = ego.stamps_ns[-1]
@@ -78,6 +79,7 @@ class TrackedObject:
         self.state: ObjectState | None = None
         self._motion = motion
         self._rejections: deque[IntArray] = deque()
+        self._points: tuple[tuple[RelativeMotion, int, gtsam.Pose3], FloatArray] | None = None
         self._place(ego)
 
     def begin_again(self, members: IntArray, motion: RelativeMotion, ego: EgoMotion) -> None:
@@ -114,8 +116,12 @@ class TrackedObject:
 
     def points(self) -> FloatArray:
         """(N, 3) its points, in its own frame, m."""
-        _, points = self._motion.points()
-        return np.asarray(self._object_T_start.transformFrom(points.T)).T.reshape(-1, 3)
+        made_of = self._motion, self._motion.taken_ns, self._object_T_start
+        if self._points is None or self._points[0] != made_of:  # many ask for them in a frame
+            _, points = self._motion.points()
+            moved = np.asarray(self._object_T_start.transformFrom(points.T)).T.reshape(-1, 3)
+            self._points = made_of, moved
+        return self._points[1]
 
     def world_points(self) -> FloatArray:
         """(N, 3) its points in the world, where they were in its last frame, m."""
@@ -129,7 +135,7 @@ class TrackedObject:
         now = ego.stamps_ns[-1]
         world_T_start = ego.poses[-1].compose(self._motion.poses[now].inverse())
         _, points = self._motion.points()
-        middle = np.median(points, axis=0) if len(points) else np.zeros(3)
+        middle = median(points) if len(points) else np.zeros(3)
         origin = gtsam.Pose3(gtsam.Rot3(), world_T_start.transformFrom(middle))
         self._object_T_start = origin.inverse().compose(world_T_start)
 
@@ -298,14 +304,14 @@ class TrackedObject:
     def shape_middle(self) -> FloatArray:
         """(3,) middle of its points, in its own frame."""
         points = self.points()
-        return np.median(points, axis=0) if len(points) else np.zeros(3)
+        return median(points) if len(points) else np.zeros(3)
 
     def size(self) -> float:
         """Largest distance of a point from the middle, m."""
         points = self.points()
         if len(points) == 0:
             return 0.0
-        return float(np.quantile(np.linalg.norm(points - self.shape_middle(), axis=1), 0.9))
+        return quantile(np.linalg.norm(points - self.shape_middle(), axis=1), 0.9)
 
     def predicted(self, stamp_ns: int) -> gtsam.Pose3 | None:
         """world_T_object at a later time, if its motion goes on; None if it is not known."""

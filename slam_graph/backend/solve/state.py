@@ -301,7 +301,7 @@ class State:
         self.points = self.points.relinearized(self.points.frozen)
         tangents = gtsam.VectorValues()
         for key, offset in self._offsets.items():
-            if key not in self._frozen and offset.any():
+            if key not in self._frozen and np.count_nonzero(offset):  # `any` takes longer
                 tangents.insert(key, offset)
                 self._offsets[key] = np.zeros(len(offset))
         if tangents.size():  # as the estimates were made, so that they are the same to the bit
