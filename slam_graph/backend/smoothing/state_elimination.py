@@ -69,7 +69,11 @@ class ChainEquations:
 
 @lru_cache
 def _columns(keys: tuple[int, ...]) -> tuple[IntArray, tuple[IntArray, ...]]:
-    """Columns of some variables of two states, and those of their square; by keys of 0 and 1."""
+    """Columns (n,) of variables of two neighbouring states, whose keys count from the first one.
+
+    Returns:
+        The columns, and what selects the entries (n, n) of a matrix in their rows and columns.
+    """
     parts = [STATE * gtsam.symbolIndex(k) + _PARTS[chr(gtsam.symbolChr(k))] for k in keys]
     columns = np.concatenate(parts)
     return columns, np.ix_(columns, columns)
