@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
+import gtsam
 import numpy as np
 import pytest
 
@@ -15,8 +16,12 @@ from slam_graph.backend.smoothing import recording_problem
 from slam_graph.backend.smoothing.cost_minimization import minimized
 from slam_graph.backend.smoothing.final_adjustment import adjust_recording
 from slam_graph.backend.smoothing.frame_log import FrameLog
+from slam_graph.backend.smoothing.keyframe_states import states_at
 from slam_graph.backend.smoothing.recording_cost import Estimates, RecordingCost
+from slam_graph.backend.smoothing.recording_problem import BundleAdjustment
+from slam_graph.backend.smoothing.recording_segment import read_segment
 from slam_graph.backend.smoothing.smoothing_config import FinalBaConfig
+from slam_graph.backend.smoothing.smoothing_task import SegmentStart, SmoothingTask
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import DataError
 from slam_graph.sensors import FeatureFrame, ImuBuffer, ImuData, Packet
@@ -169,3 +174,31 @@ def test_a_step_lowers_the_cost_by_what_it_predicts(
     before, after = cost.value(away), cost.value(away.moved(step))
     assert step.predicted > 0.1 * before
     assert np.isclose(before - after, step.predicted, rtol=0.05)
+    factor = linear.factor(0.0)
+    again = factor.renewed(linear, 0.0).step(linear)
+    assert np.allclose(again.states, step.states, rtol=0.0, atol=1e-9)
+    assert np.allclose(again.points, step.points, rtol=0.0, atol=1e-9)
+    at_end = cost.linearized(end)
+    assert at_end.factor(0.0).step(at_end).predicted < config.tolerance * cost.value(end)
+
+
+def test_a_keyframe_that_is_off_is_moved_before_outliers_are_judged(
+    log: FrameLog, flight: SimulatedSequence
+) -> None:
+    task = SmoothingTask.of(flight.rig, BackendConfig(), FinalBaConfig())
+    segment = read_segment(log, log.keyframes, task.rig, task.backend.zero_velocity)
+    truth = states_at(
+        flight.groundtruth(), segment.keyframe_stamps_ns, segment.imu, task.preintegration
+    )
+    moved = gtsam.Pose3(gtsam.Rot3(), np.array([0.1, 0.0, 0.0]))
+    off = list(truth)
+    off[5] = replace(off[5], world_T_body=off[5].world_T_body * moved)
+    found = [
+        BundleAdjustment(SegmentStart(segment, states, 0, truth), task, lambda *_: None).solve()
+        for states in (truth, off)
+    ]
+    assert found[0].figures.iterations < found[1].figures.iterations
+    assert found[0].figures.observations == found[1].figures.observations
+    for own, other in zip(*(part.states for part in found), strict=True):
+        away = own.world_T_body.between(other.world_T_body)
+        assert np.linalg.norm(gtsam.Pose3.Logmap(away)) < 5e-3  # it was 0.1 m off

@@ -481,6 +481,10 @@ def test_eliminate_features() -> None:
         roots = np.empty((features, 3, 3))
         eliminate(by_pose, by_point, frame, views, starts, 0.3, information, roots, T)
         results.append((np.tril(information), roots, T))
+        alone, T = np.empty((features, 3, 3)), np.empty(T.shape)
+        eliminate(by_pose, by_point, frame, views, starts, 0.3, np.empty((0, 0)), alone, T)
+        assert same(alone, roots)
+        assert same(T, results[-1][2])
     assert all(same(own, other) for own, other in zip(*results, strict=True))
 
 

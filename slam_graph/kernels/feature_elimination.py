@@ -61,11 +61,11 @@ def eliminate_features(
         starts: (J + 1,) first view of each feature, and M.
         damping: is added to the diagonal of V.
         information: (n, n) of the poses, 6 for each, and anything behind them; its lower triangle
-            is added to. What is above is undefined afterwards.
+            is added to. What is above is undefined afterwards. Nothing is added where n is zero.
         inverse_roots: (J, 3, 3), filled: L⁻¹; not finite where V is not positive definite.
         T: (M, 3, 6), filled.
     """
-    longest = 0
+    longest, reduces = 0, len(information) > 0
     for j in range(len(inverse_roots)):
         longest = max(longest, starts[j + 1] - starts[j])
     rows, V, W = np.empty((3, 6 * longest)), np.empty((3, 3)), np.empty((3, 6))
@@ -90,8 +90,9 @@ def eliminate_features(
                         x = by_pose[n, i, a]
                         for k in range(3):
                             W[k, a] += by_point[n, i, k] * x
-                        for b in range(a + 1):
-                            information[pose + a, pose + b] += x * by_pose[n, i, b]
+                        if reduces:
+                            for b in range(a + 1):
+                                information[pose + a, pose + b] += x * by_pose[n, i, b]
             for k in range(3):
                 for a in range(6):
                     x = 0.0
@@ -99,7 +100,7 @@ def eliminate_features(
                         x += inverse[k, i] * W[i, a]
                     T[v, k, a] = x
                     rows[k, 6 * (v - first) + a] = x
-        u = first
+        u = first if reduces else stop
         while u < stop:  # views by consecutive frames are consecutive columns
             end = u + 1
             while end < stop and frame[end] == frame[end - 1] + 1:
@@ -129,11 +130,12 @@ def eliminate_features_numpy(
     T: FloatArray,
 ) -> None:
     """`eliminate_features` in NumPy, feature by feature."""
+    size = 6 * (int(np.max(frame, initial=-1)) + 1)
     for j in range(len(inverse_roots)):
         first, stop = starts[j], starts[j + 1]
         seen = range(views[first], views[stop])
         owner = np.repeat(np.arange(first, stop), np.diff(views[first : stop + 1]))
-        H = np.zeros((2 * len(seen), len(information)))
+        H = np.zeros((2 * len(seen), len(information) or size))
         for k, (n, v) in enumerate(zip(seen, owner, strict=True)):
             pose = 6 * frame[v]
             H[2 * k : 2 * k + 2, pose : pose + 6] = by_pose[n]
@@ -142,4 +144,5 @@ def eliminate_features_numpy(
         whole = inverse_roots[j] @ F.T @ H
         for v in range(first, stop):
             T[v] = whole[:, 6 * frame[v] : 6 * frame[v] + 6]
-        information += H.T @ H - whole.T @ whole
+        if len(information) > 0:
+            information += H.T @ H - whole.T @ whole

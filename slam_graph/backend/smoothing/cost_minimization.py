@@ -4,7 +4,8 @@
 
 A factor costs many times as much as a gradient and a solution by it. After a step that hardly
 changes the cost, or changes it as predicted, the factor is nearly that of the new estimates, and
-steps by it converge, linearly and fast (the chord method: Kelley 1995, ch. 5).
+steps by it converge, linearly and fast (the chord method: Kelley 1995, ch. 5). Only the states keep
+their factor: features, which cost little and change most, are eliminated anew in each step.
 """
 
 from __future__ import annotations
@@ -29,7 +30,8 @@ _CONTRACTION = 0.2
 """An earlier factor is kept only as long as each step lowers the cost by less than this part of
 what the step before did."""
 _CAUTION = 0.01
-"""Steps by an earlier factor converge linearly: in the end their decrease must be less by this."""
+"""Steps by an earlier factor converge linearly. They end where those that would follow lower the
+cost by less than this part of what a new factor's last step may."""
 
 
 def minimized(
@@ -59,7 +61,7 @@ def minimized(
     damped = damping
     factor: Factor | None = None
     known: EliminatedStates | None = None
-    before = math.inf
+    before, chord = math.inf, 0
     for _ in range(max_steps):
         linear = cost.linearized(estimates)
         while True:
@@ -68,6 +70,8 @@ def minimized(
                 if factor is None:
                     known = None  # it is large
                     factor, damped = linear.factor(damping), damping
+                else:
+                    factor = factor.renewed(linear, damped)
                 step = factor.step(linear)
                 moved = estimates.moved(step)
                 # an earlier factor that predicts more than all of the cost is not that of this one
@@ -83,7 +87,10 @@ def minimized(
         known = factor.states if damped <= _FIRST_DAMPING else None
         decrease, estimates, value = value - after, moved, after
         count_step()
-        if decrease <= tolerance * value * (1.0 if fresh else _CAUTION):
+        chord = 0 if fresh else chord + 1
+        rate = min(decrease / before, 0.5) if chord > 1 else 0.5
+        left = decrease * rate / (1.0 - rate)  # what is gained if steps go on contracting like this
+        if (decrease if fresh else left / _CAUTION) <= tolerance * value:
             break
         damping *= 0.1 if fresh else 1.0
         slow = not fresh and decrease > _CONTRACTION * before

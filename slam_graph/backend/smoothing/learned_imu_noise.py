@@ -10,17 +10,20 @@ from dataclasses import dataclass
 
 import gtsam
 import numpy as np
+from scipy.linalg import blas
 
 from slam_graph.arrays import FloatArray
 from slam_graph.backend.smoothing.recording_cost import (
-    EliminatedFeatures,
     Estimates,
-    Factor,
     RecordingCost,
+    moved_states,
 )
 from slam_graph.backend.smoothing.recording_factors import RecordingFactors
-from slam_graph.backend.smoothing.state_elimination import ChainEquations, EliminatedStates
-from slam_graph.errors import EstimationError
+from slam_graph.backend.smoothing.state_elimination import (
+    STATE,
+    ChainEquations,
+    EliminatedStates,
+)
 from slam_graph.sensors import AidingData
 
 logger = logging.getLogger(__name__)
@@ -55,6 +58,52 @@ class ImageEquations:
     gradient: FloatArray
 
 
+class _LinearImages:
+    """What images and position fixes say of K keyframe states: linear around a minimum.
+
+    Args:
+        found: the minimum.
+
+    Attributes:
+        features: what was eliminated.
+        gradient: (K, 6) right-hand side by the poses, at the states that were moved to.
+    """
+
+    def __init__(self, found: Minimum) -> None:
+        linear, keyframes = found.cost.linearized(found.estimates), found.cost.keyframes
+        self.features = linear.eliminated()
+        self.gradient, self._t = self.features.reduced(*linear.images.gradient(keyframes))
+        self._by_fixes, fixes = np.zeros(0), self.features.fixes
+        if linear.fixes is not None and fixes is not None:
+            by_pose, self._by_fixes = linear.fixes.gradient(keyframes)
+            self.gradient += fixes.reduced(by_pose, self._by_fixes)
+        self._moved = np.zeros((keyframes, STATE))
+
+    def factor(self, chain: ChainEquations) -> EliminatedStates:
+        """The factor of the states with all other factors."""
+        return EliminatedStates(self.features.poses.copy(), chain)
+
+    def step(self, states: EliminatedStates, chain: ChainEquations) -> FloatArray:
+        """Moves by a Gauss-Newton step: the increments (K, 15) of the states."""
+        gradient = chain.gradient.copy()
+        gradient[:, :6] += self.gradient
+        moved = states.times_covariance(gradient[:, :, None])[:, :, 0]
+        information = self.features.poses  # its lower triangle
+        poses = np.zeros(len(information))
+        poses[: self.gradient.size] = moved[:, :6].ravel()
+        change = blas.dsymv(1.0, information.T, poses)
+        self.gradient -= change[: self.gradient.size].reshape(-1, 6)
+        self._moved += moved
+        return moved
+
+    def moved(self, estimates: Estimates, states: gtsam.Values) -> Estimates:
+        """The minimum with the states that were moved to, and all else where it is best."""
+        poses, fixes = self._moved[:, :6], self.features.fixes
+        shared = np.zeros(0) if fixes is None else fixes.step(self._by_fixes, poses)
+        points = estimates.points + self.features.points(self._t, poses)
+        return Estimates(states, points, estimates.fixes + shared)
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class EliminatedMinimum:
     """The normal equations at a minimum, with a fixed gauge, and their factor.
@@ -76,8 +125,7 @@ class EliminatedMinimum:
 
     def chain(self) -> ChainEquations:
         """The equations of the other factors."""
-        keyframes = self.values.size() // 3
-        return ChainEquations.of(self.inertial.linearize(self.values), keyframes)
+        return _chain(self.inertial, self.values)
 
 
 def equations_at_minimum(
@@ -107,60 +155,49 @@ def equations_at_minimum(
         RuntimeError: if GTSAM cannot linearise a factor.
         LinAlgError: if the cost does not determine all variables.
     """
-    cost, estimates = found.cost, found.estimates
-    features = cost.linearized(estimates).eliminated()
-    inertial, states = cost.inertial, None
-    known = near or _eliminated(features, cost, factors, estimates)
+    images, cost, estimates = _LinearImages(found), found.cost, found.estimates
+    inertial, values, given = cost.inertial, estimates.states, factors.noise
+    states: EliminatedStates | None = None
+    known = near or images.factor(_chain(_with_gauge(inertial, factors, values), values))
     for _ in range(_ROUNDS if learn else 0):
         assumed = factors.noise
-        if not factors.learn_noise(inertial, estimates.states, known.times_covariance):
+        if not factors.learn_noise(inertial, values, known.times_covariance):
             break
         try:
-            changed = factors.inertial(estimates.states)
-            under = cost.with_inertial(_with_gauge(changed, factors, estimates))
-            linear = under.linearized(estimates)
-            known = EliminatedStates(features.poses.copy(), linear.chain)
-            moved = estimates.moved(Factor(features, known).step(linear))
-            if not under.value(moved) <= under.value(estimates):
-                raise EstimationError("a step under it raises the cost")
-        except (EstimationError, RuntimeError, np.linalg.LinAlgError) as error:
+            changed = factors.inertial(values)
+            chain = _chain(_with_gauge(changed, factors, values), values)
+            known = images.factor(chain)
+        except (RuntimeError, np.linalg.LinAlgError) as error:
             logger.info("the noise of the IMU is not learned: %s", error)
             factors.noise = assumed
             break
-        inertial, estimates, states = changed, moved, known
+        values = moved_states(values, images.step(known, chain))
+        inertial, states = changed, known
         count_step()
-    states = states or _eliminated(features, cost, factors, estimates)
-    inertial = _with_gauge(inertial, factors, estimates)
-    images = None
-    if keep:
-        linear = cost.linearized(estimates)
-        gradient = features.reduced(*linear.images.gradient(cost.keyframes))[0]
-        if linear.fixes is not None and features.fixes is not None:
-            gradient += features.fixes.reduced(*linear.fixes.gradient(cost.keyframes))
-        images = ImageEquations(features.poses, gradient)
-    fixes = None
+    moved = images.moved(estimates, values)
+    under = cost.with_inertial(_with_gauge(inertial, factors, values))
+    if not under.value(moved) <= under.value(estimates):
+        logger.info("the noise of the IMU is not learned: steps under it raise the cost")
+        images, moved, factors.noise = _LinearImages(found), estimates, given
+        under, states = cost.with_inertial(_with_gauge(cost.inertial, factors, moved.states)), None
+    states = states or images.factor(_chain(under.inertial, moved.states))
+    fixes, features = None, images.features
     if cost.fixes is not None and features.fixes is not None:
         covariance = features.fixes.covariance(states)
-        fixes = cost.fixes.calibration(estimates.fixes, covariance)
-    return EliminatedMinimum(images, inertial, estimates.states, states, fixes)
+        fixes = cost.fixes.calibration(moved.fixes, covariance)
+    kept = ImageEquations(features.poses, images.gradient) if keep else None
+    return EliminatedMinimum(kept, under.inertial, moved.states, states, fixes)
 
 
-def _eliminated(
-    features: EliminatedFeatures,
-    cost: RecordingCost,
-    factors: RecordingFactors,
-    estimates: Estimates,
-) -> EliminatedStates:
-    """The factor of the states with a fixed gauge."""
-    inertial = _with_gauge(cost.inertial, factors, estimates)
-    chain = ChainEquations.of(inertial.linearize(estimates.states), cost.keyframes)
-    return EliminatedStates(features.poses.copy(), chain)
+def _chain(inertial: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> ChainEquations:
+    """Factors on K states, linearised."""
+    return ChainEquations.of(inertial.linearize(values), values.size() // 3)
 
 
 def _with_gauge(
-    inertial: gtsam.NonlinearFactorGraph, factors: RecordingFactors, estimates: Estimates
+    inertial: gtsam.NonlinearFactorGraph, factors: RecordingFactors, values: gtsam.Values
 ) -> gtsam.NonlinearFactorGraph:
     """Priors, IMU and zero-velocity factors with a fixed gauge."""
     graph = gtsam.NonlinearFactorGraph(inertial)
-    graph.push_back(factors.gauge(estimates.states))
+    graph.push_back(factors.gauge(values))
     return graph

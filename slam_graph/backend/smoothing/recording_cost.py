@@ -49,13 +49,18 @@ class Estimates:
 
     def moved(self, step: Step) -> Estimates:
         """The estimates after a step."""
-        delta = gtsam.VectorValues()
-        for k, state in enumerate(step.states):
-            delta.insert(X(k), state[:6])
-            delta.insert(V(k), state[6:9])
-            delta.insert(B(k), state[9:])
-        states = self.states.retract(delta)
+        states = moved_states(self.states, step.states)
         return Estimates(states, self.points + step.points, self.fixes + step.fixes)
+
+
+def moved_states(states: gtsam.Values, increments: FloatArray) -> gtsam.Values:
+    """X(k), V(k) and B(k) of K keyframes after increments (K, 15)."""
+    delta = gtsam.VectorValues()
+    for k, increment in enumerate(increments):
+        delta.insert(X(k), increment[:6])
+        delta.insert(V(k), increment[6:9])
+        delta.insert(B(k), increment[9:])
+    return states.retract(delta)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -175,6 +180,7 @@ class EliminatedFeatures:
         keyframes: int,
         damping: float = 0.0,
         fixes: LinearFixes | None = None,
+        reduce: bool = True,
     ) -> None:
         obs = linear.obs
         new = np.ones(len(obs), np.bool_)
@@ -183,7 +189,7 @@ class EliminatedFeatures:
         self._feature, self._frame = obs.feature[first], obs.frame[first]
         self._inverse_roots = np.empty((len(obs.ids), 3, 3))
         self._T = np.empty((len(first), 3, 6))
-        self.poses = np.zeros((StateColumns.of(keyframes).size,) * 2)
+        self.poses = np.zeros((StateColumns.of(keyframes).size if reduce else 0,) * 2)
         eliminate_features(
             linear.by_pose,
             linear.by_point,
@@ -198,7 +204,8 @@ class EliminatedFeatures:
         self.fixes: EliminatedFixes | None = None
         if fixes is not None:
             self.fixes = EliminatedFixes(fixes, keyframes, damping)
-            self.fixes.add_to(self.poses)
+            if reduce:
+                self.fixes.add_to(self.poses)
 
     def reduced(self, by_pose: FloatArray, by_point: FloatArray) -> tuple[FloatArray, FloatArray]:
         """The gradient (K, 6) by the poses without features, and L⁻¹ times that (J, 3) by these."""
@@ -231,6 +238,10 @@ class Factor:
 
     features: EliminatedFeatures
     states: EliminatedStates
+
+    def renewed(self, linear: LinearCost, damping: float) -> Factor:
+        """The factor with features eliminated anew, which is cheap, and the states as they were."""
+        return Factor(linear.eliminated(damping, reduce=False), self.states)
 
     def step(self, linear: LinearCost) -> Step:
         """The Gauss-Newton step from where a cost is linearised, by the factor at any estimates."""
@@ -268,9 +279,10 @@ class LinearCost:
     images: LinearReprojection
     fixes: LinearFixes | None = None
 
-    def eliminated(self, damping: float = 0.0) -> EliminatedFeatures:
-        """The factor of all but the states."""
-        return EliminatedFeatures(self.images, len(self.chain.gradient), damping, self.fixes)
+    def eliminated(self, damping: float = 0.0, reduce: bool = True) -> EliminatedFeatures:
+        """The factor of all but the states; `reduce`: and what it leaves of the poses."""
+        keyframes = len(self.chain.gradient)
+        return EliminatedFeatures(self.images, keyframes, damping, self.fixes, reduce)
 
     def factor(self, damping: float) -> Factor:
         """The factor of the normal equations, damped.

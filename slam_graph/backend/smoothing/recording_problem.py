@@ -3,10 +3,11 @@
 """Visual-inertial bundle adjustment of a segment: all keyframe states and features at once.
 
 The cost (`recording_factors.py`) is that of the recursive estimators without a window. It is
-minimised by Levenberg-Marquardt: first to a loose tolerance with all observations, then to the end
-without outliers, with features triangulated and IMU samples preintegrated anew. The noise of both
-sensors is read from the residuals at this minimum: how far the errors of tracks are correlated, and
-then how noisy the IMU is. The states are those of the minimum under it.
+minimised by Levenberg-Marquardt: first to a loose tolerance with all observations, unless the poses
+are near that minimum already; then to the end without outliers, with features triangulated and IMU
+samples preintegrated anew. The noise of both sensors is read from the residuals at this minimum:
+how far the errors of tracks are correlated, and then how noisy the IMU is. The states are those of
+the minimum under it.
 """
 
 from __future__ import annotations
@@ -71,6 +72,9 @@ _MIN_KEYFRAMES = 3
 """A feature must be seen in this many keyframes."""
 _MIN_SIGMA_RATIO = 0.1
 """The learned noise of the tracks is at least this part of the configured one."""
+_SAME_FIT = 1.5
+"""Poses are near the minimum where the median residual of each keyframe is below this many times
+that of all: then the outliers are the same, and the minimum is a step away."""
 _LOOSE_TOLERANCE = 1e-3
 """Relative decrease of the cost at which the steps before the last minimum end."""
 
@@ -107,6 +111,7 @@ class BundleAdjustment:
         self._sigma_px, self._inefficiency = backend.noise.pixel_sigma, 1.0
         self._values, self._shared = values_of(start.states), segment.aiding.shared()
         self._given = values_of(start.given or start.states)
+        self._of_others = start.given is not None  # states are a minimum of some of the keyframes
         self._factor: EliminatedStates | None = None
         self._note_motions()
 
@@ -122,9 +127,11 @@ class BundleAdjustment:
             EstimationError: if there is no minimum.
         """
         keyframes = self._segment.keyframes
-        self._minimize_loosely()
         points, good = self._triangulated(self._candidates)
-        points, good = self._with_estimates(self._candidates, points, good)
+        if not self._of_others or not self._fits_alike(self._candidates.subset(good), points[good]):
+            self._minimize_loosely()
+            points, good = self._triangulated(self._candidates)
+            points, good = self._with_estimates(self._candidates, points, good)
         self._note_motions()
         if self._config.learn_pixel_sigma:
             self._learn_pixel_sigma(self._candidates.subset(good), points[good])
@@ -188,6 +195,17 @@ class BundleAdjustment:
         known = np.isin(obs.ids, self._minimum.cost.images.obs.ids)  # both are ascending
         points[known] = self._minimum.estimates.points
         return points, good | known
+
+    def _fits_alike(self, obs: Observations, points: FloatArray) -> bool:
+        """Whether the observations of each keyframe fit its pose as well as those of the others."""
+        at = Geometry(*stacked_poses(self._values, obs.frames), points)
+        lengths = np.linalg.norm(self._projection.residuals(obs, at)[0], axis=1)
+        if len(lengths) == 0:
+            return False
+        counts = np.bincount(obs.frame)
+        middle = np.cumsum(counts) - counts + counts // 2
+        medians = lengths[np.lexsort((lengths, obs.frame))][middle[counts > 0]]
+        return bool(np.all(medians < _SAME_FIT * np.median(lengths)))
 
     def _learn_pixel_sigma(self, obs: Observations, points: FloatArray) -> None:
         """Estimate the noise of the tracks from the median of their residuals at the minimum.

@@ -67,7 +67,8 @@ class SegmentStart:
         segment: times, observations, IMU samples.
         states: initial states of the keyframes.
         anchor: number of the keyframe whose position and yaw are fixed.
-        given: states of the keyframes before any adjustment, for `cost_before`; `states` if None.
+        given: states of the keyframes before any adjustment, for `cost_before`, where `states` are
+            adjusted to the observations of some of them; None where they are not.
     """
 
     segment: RecordingSegment
