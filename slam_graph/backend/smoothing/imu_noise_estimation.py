@@ -2,17 +2,23 @@
 # SPDX-License-Identifier: Apache-2.0
 """The noise of the IMU over a recording, estimated from the residuals at the minimum.
 
-Variance components (Förstner 1979; Teunissen & Amiri-Simkooei 2008): a residual r of covariance Q
-before the adjustment has Q - A P Aᵀ after it, A being its Jacobian and P the covariance of the
-states. So for the residuals of one kind, all of whose variances are wrong by the same ratio,
+Variance components (Patterson & Thompson 1971; Teunissen & Amiri-Simkooei 2008): whitened residuals
+e of covariance I before the adjustment have M = I - W P Wᵀ after it, W being their Jacobian and P
+the covariance of the states. A ratio θ_k of the variance of one kind of noise changes the
+covariance Q = L Lᵀ of a residual by θ_k^½ in its own rows and columns E_k, so that of the whitened
+one by S_k = ½ (L⁻¹ E_k L + Lᵀ E_k L⁻ᵀ). The ratios explain the squares (Fisher scoring),
 
-    ratio = Σ rᵀ Q⁻¹ r / Σ (dim r - tr Q⁻¹ A P Aᵀ),
+    Σ_l F_kl (θ_l - 1) = eᵀ S_k e - tr S_k M,   F_kl = tr S_k M S_l M.
 
-whose denominator, the redundancy, is how many of the residuals the images can contradict. Its trace
-is estimated by random signs (Hutchinson 1990), which takes solutions of the linear problem in place
-of all covariances: with W_i the rows of Q^-½ A of the residual i and signs z_i, the mean of wᵀ P w
-of w = Σ W_iᵀ z_i is Σ tr W_i P W_iᵀ. The redundancy has a standard deviation of at most
-√(2 redundancy / 16).
+The trace, the redundancy, is how many of the residuals the images can contradict; F is twice the
+information on the ratios. White noise and random walk explain the same residuals in part, and F
+tells them apart. Both are estimated by random signs (Hutchinson 1990), which takes solutions of the
+linear problem in place of all covariances: with signs z, u_k = M S_k z follows from P Wᵀ S_k z, and
+
+    tr S_k M = E zᵀ u_k,   F_kl = E u_kᵀ S_l Σ_k u_k,
+
+as the S_k add up to I. What walks add to the other residuals within an interval counts for the
+kinds of these: some hundredths of their standard deviation.
 """
 
 from __future__ import annotations
@@ -27,16 +33,21 @@ import numpy as np
 
 from slam_graph.arrays import FloatArray
 from slam_graph.backend.cost.adaptive_imu_noise import MAX_FACTOR
+from slam_graph.backend.smoothing.state_elimination import STATE
 from slam_graph.sensors import ImuNoise
 
-_ROWS = (slice(0, 3), slice(6, 9), slice(9, 12), slice(12, 15))
-"""Rows of a residual that show each kind of noise: rotation, velocity, both biases."""
+_KINDS = np.repeat(np.eye(4), [3, 6, 3, 3], axis=1)
+"""(4, 15) rows of a residual that show each kind of noise: rotation, position and velocity, both
+biases."""
 _SAME_FACTOR = 1.2
 """Noise densities whose ratio is below this are taken for the same."""
 _PROBES = 16
-"""Vectors of random signs for each kind of noise."""
-_PRIOR_REDUNDANCY = 10.0
-"""Redundancy that the assumed noise counts for: what the images cannot tell stays as it is."""
+"""Vectors of random signs."""
+_PRIOR_INFORMATION = 10.0
+"""What the assumed noise counts for in F, as ten residuals that nothing but it explains: what the
+images cannot tell stays as it is."""
+_LARGEST_RATIO = 9.0
+"""Variances change by this factor at most in a round."""
 
 TimesCovariance = Callable[[FloatArray], FloatArray]
 """The product (K, 15, m) of the covariance of K states with a matrix (K, 15, m)."""
@@ -117,25 +128,30 @@ def variance_ratios(
         gyroscope.
     """
     if not factors:
-        return np.ones(len(_ROWS))
-    rng = np.random.default_rng(0)
-    squares, kinds = np.zeros(len(_ROWS)), len(_ROWS)
-    signs = rng.choice([-1.0, 1.0], (len(factors), kinds, 3, _PROBES))
+        return np.ones(len(_KINDS))
     r, A, Q = _residuals(factors, values)
-    w = np.empty((len(factors), A.shape[2], kinds, _PROBES))
-    for kind, rows in enumerate(_ROWS):
-        white = np.linalg.inv(np.linalg.cholesky(Q[:, rows, rows]))
-        squares[kind] = np.sum((white @ r[:, rows, None]) ** 2)
-        w[:, :, kind] = (white @ A[:, rows]).transpose(0, 2, 1) @ signs[:, kind]
-    w = w.reshape(len(factors), 2, -1, kinds * _PROBES)  # of the first state, and of the second
+    L = np.linalg.cholesky(Q)
+    white = np.linalg.inv(L)
+    W, e = white @ A, (white @ r[:, :, None])[:, :, 0]
+    S = 0.5 * (white[:, None] * _KINDS[:, None, :]) @ L[:, None]  # (M, kinds, 15, 15)
+    S += S.transpose(0, 1, 3, 2)
+    signs = np.random.default_rng(0).choice([-1.0, 1.0], (len(factors), 1, S.shape[2], _PROBES))
+    u = S @ signs
     first = np.array([gtsam.symbolIndex(factor.keys()[0]) for factor in factors])
-    right = np.zeros((keyframes, *w.shape[2:]))
-    np.add.at(right, first, w[:, 0])
-    np.add.at(right, first + 1, w[:, 1])
-    products = np.sum(right * times_covariance(right), axis=(0, 1))
-    predicted = products.reshape(kinds, _PROBES).mean(axis=1)
-    redundancy = np.maximum(3.0 * len(factors) - predicted, 0.0) + _PRIOR_REDUNDANCY
-    return np.asarray((squares + _PRIOR_REDUNDANCY) / redundancy)
+    pairs = W.transpose(0, 2, 1)[:, None] @ u  # (M, kinds, 30, probes), of states k and k + 1
+    states = pairs.transpose(0, 2, 1, 3).reshape(len(factors), 2, STATE, -1)
+    right = np.zeros((keyframes, STATE, states.shape[3]))
+    np.add.at(right, first, states[:, 0])
+    np.add.at(right, first + 1, states[:, 1])
+    solved = times_covariance(right)
+    moved = np.concatenate([solved[first], solved[first + 1]], axis=1)
+    u -= (W @ moved).reshape(len(factors), -1, len(_KINDS), _PROBES).transpose(0, 2, 1, 3)
+    F = np.einsum("mkap,mlap->kl", u, S @ u.sum(axis=1, keepdims=True)) / _PROBES
+    F = 0.5 * (F + F.T) + _PRIOR_INFORMATION * np.eye(len(F))
+    redundancy = np.einsum("map,mkap->k", signs[:, 0], u) / _PROBES
+    squares = np.einsum("ma,mkab,mb->k", e, S, e)
+    ratios = 1.0 + np.linalg.solve(F, squares - redundancy)
+    return np.asarray(np.clip(ratios, 1.0 / _LARGEST_RATIO, _LARGEST_RATIO))
 
 
 def _residuals(
