@@ -141,7 +141,8 @@ def test_samples_are_put_on_the_old_clock() -> None:
 @pytest.mark.parametrize(("seed", "by_s"), [slow(3, 0.03), (4, -0.06)])
 def test_a_run_goes_on_in_a_new_segment(seed: int, by_s: float) -> None:
     """Within five seconds, and as well as a clean run does; the whole is as good when smoothed."""
-    clean, late = sg.run(flight(seed=seed)), sg.run(flight(by_s, seed=seed))
+    seconds = CHANGED_S + 6.0
+    clean, late = (sg.run(flight(by, seed=seed, duration_s=seconds)) for by in (None, by_s))
     assert late.status == "ok", late.message
     (_, after) = late.segments
     assert after.joined_by == "imu"

@@ -48,19 +48,25 @@ def test_the_wheels_tracks(data_dir: Path, algorithm: str) -> None:
 
 @pytest.mark.data
 @pytest.mark.parametrize(
-    ("algorithm", "cameras", "position_m", "angle_deg"),
+    ("algorithm", "cameras", "seconds", "position_m", "angle_deg"),
     [
-        slow("msckf", 1, 0.019, 0.21),
-        ("msckf", 2, 0.015, 0.19),
-        slow("swf", 2, 0.015, 0.19),
+        slow("msckf", 1, 30.0, 0.019, 0.21),
+        ("msckf", 2, 15.0, 0.015, 0.19),
+        slow("msckf", 2, 30.0, 0.015, 0.19),
+        slow("swf", 2, 30.0, 0.015, 0.19),
     ],
 )
 def test_a_simulation_from_a_given_start(
-    data_dir: Path, algorithm: str, cameras: int, position_m: float, angle_deg: float
+    data_dir: Path,
+    algorithm: str,
+    cameras: int,
+    seconds: float,
+    position_m: float,
+    angle_deg: float,
 ) -> None:
-    """The first 30 s, not aligned: the world is that of the start state."""
+    """The first seconds, not aligned: the world is that of the start state."""
     sequence = open_dataset(data_dir / "openvins_sim" / "euroc_V1_01", cameras=cameras)
-    result = run(sequence, load_config(overrides=CAUSAL, algorithm=algorithm, duration_s=30.0))
+    result = run(sequence, load_config(overrides=CAUSAL, algorithm=algorithm, duration_s=seconds))
     assert result.status == "ok"
     assert result.start_was_given
     assert result.coverage > 0.999
@@ -128,10 +134,14 @@ def test_every_algorithm_gives_positive_definite_covariances(contract_run: RunRe
 
 
 def test_every_algorithm_is_deterministic(contract_run: RunResult) -> None:
-    """Two runs give the same states to the last bit."""
+    """Two runs give the same states to the last bit; the second one ends soon after take-off."""
     algorithm = contract_run.config.algorithm
-    again = run(open_dataset("demo"), load_config(algorithm=algorithm.name, **CONTRACT))
+    again = run(
+        open_dataset("demo"), load_config(algorithm=algorithm.name, **{**CONTRACT, "duration_s": 3})
+    )
+    count = len(again.trajectory)
+    assert count > 30
     for name in ("stamps_ns", "positions", "quaternions", "velocities", "gyro_biases"):
         one, two = (getattr(r.trajectory, name) for r in (contract_run, again))
-        np.testing.assert_array_equal(one, two)
-    np.testing.assert_array_equal(contract_run.history.sigmas(), again.history.sigmas())
+        np.testing.assert_array_equal(one[:count], two)
+    np.testing.assert_array_equal(contract_run.history.sigmas()[:count], again.history.sigmas())
