@@ -7,7 +7,6 @@
 
 import os
 import random
-import re
 import shutil
 import time
 import traceback
@@ -23,6 +22,8 @@ from slam_graph.settings import tree
 CAMPAIGN = int(os.environ.get("SLAM_GRAPH_MUTATIONS", "0"))
 SEED = os.environ.get("SLAM_GRAPH_MUTATIONS_SEED", str(time.time_ns()) if CAMPAIGN else "0")
 IN_CI = 200
+
+ON_LINUX = Path("/proc/self/status").exists()
 
 MOST_S, MOST_MB = 2.0, 256.0
 """No damaged file of some 10 kB may take more time of the CPU and more memory."""
@@ -124,13 +125,14 @@ def tried(
 
 def memory_mb(reset: bool = False) -> float:
     """Peak of the resident memory since it was reset; 0 where the system does not say it."""
-    status = Path("/proc/self/status")
-    if not status.exists():
+    if not ON_LINUX:
         return 0.0
     if reset:
-        Path("/proc/self/clear_refs").write_text("5")
-    (peak,) = re.findall(r"VmHWM:\s*(\d+) kB", status.read_text())
-    return int(peak) / 1024
+        with open("/proc/self/clear_refs", "wb", buffering=0) as file:
+            file.write(b"5")
+    with open("/proc/self/status", "rb", buffering=0) as file:
+        status = file.read(1 << 14)
+    return int(status.partition(b"VmHWM:")[2].split(maxsplit=1)[0]) / 1024
 
 
 def failure_of(read: Callable[[], object], most_s: float = MOST_S) -> tuple[str, str] | None:
