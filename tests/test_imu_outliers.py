@@ -103,7 +103,7 @@ def error_m(*faults: str) -> float:
     """Of a run that ends well."""
     config = load_config(algorithm="msckf", overrides=["final_ba.enabled=false"])
     sequence = inject(
-        simulate(trajectory="figure8", cameras=2, duration_s=20.0, rate_hz=10.0), faults
+        simulate(trajectory="figure8", cameras=2, duration_s=13.0, rate_hz=10.0), faults
     )
     result = run(sequence, config)
     assert result.status == "ok", result.message
@@ -117,7 +117,7 @@ def error_m(*faults: str) -> float:
 )
 def test_a_run_survives_them(fault: str) -> None:
     """Its path is hardly worse than without the fault."""
-    assert error_m(f"{fault}:at_s=12") < 2.0 * error_m()
+    assert error_m(f"{fault}:at_s=8") < 2.0 * error_m()
 
 
 @pytest.mark.slow

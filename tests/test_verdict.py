@@ -366,7 +366,7 @@ def test_what_follows_the_loss_that_ends_a_run_is_not_compared(
 @pytest.mark.parametrize(("all_used", "status"), [slow(True, "suspect"), (False, "ok")])
 def test_what_the_estimator_used_must_show_a_fault_as_well(all_used: bool, status: str) -> None:
     """Most features are on a body that looks like the world to a camera that is turned by 8°."""
-    flight = simulate(trajectory="random", duration_s=12.0, rate_hz=RATE_HZ, seed=1)
+    flight = simulate(trajectory="random", duration_s=9.0, rate_hz=RATE_HZ, seed=1)
     result = run(flight, algorithm="msckf", overrides=CAUSAL)
     assert result.status == "ok"
     judged, none = verdict.Verdict(result, Diagnostics()), np.zeros(0, np.int64)
