@@ -69,8 +69,9 @@ def test_points_ahead() -> None:
     points, used = rng.normal(0.0, 3.0, (50, 3)), rng.random(50) < 0.8
     points[4] = np.nan  # as of a feature without a point
     turn, centre = Rotation.random(random_state=3).as_matrix(), rng.normal(size=3)
+    bounds = np.array([[-0.9, -1.2], [1.2, 0.5]])
     found, expected = (
-        ahead(kernel, points, used, turn, centre, 0.1, 2.0)
+        ahead(kernel, points, used, turn, centre, 0.1, 2.0, bounds)
         for kernel in (points_ahead, points_ahead_numpy)
     )
     assert np.array_equal(found[0], expected[0])

@@ -27,7 +27,7 @@ __all__ = [
 ]
 
 
-@compiled("i8(f8[:, :], b1[:], f8[:, :], f8[:], f8, f8, i8[::1], f8[:, ::1])")
+@compiled("i8(f8[:, :], b1[:], f8[:, :], f8[:], f8, f8, f8[:, :], i8[::1], f8[:, ::1])")
 def points_ahead(
     points: FloatArray,
     used: BoolArray,
@@ -35,6 +35,7 @@ def points_ahead(
     centre: FloatArray,
     nearest: float,
     square: float,
+    bounds: FloatArray,
     rows: IntArray,
     normalized: FloatArray,
 ) -> int:
@@ -47,6 +48,7 @@ def points_ahead(
         centre: (3,) of the camera in the world.
         nearest: least depth, m.
         square: squared length of the longest normalised point that is seen.
+        bounds: (2, 2) least and largest coordinates of normalised points.
         rows: (J,), filled from the beginning with the rows of these points.
         normalized: (J, 2), filled likewise.
 
@@ -54,6 +56,7 @@ def points_ahead(
         How many there are.
     """
     R, count = world_R_camera, 0
+    left, top, right, bottom = bounds[0, 0], bounds[0, 1], bounds[1, 0], bounds[1, 1]
     for j in range(len(points)):
         if not used[j]:
             continue
@@ -63,7 +66,7 @@ def points_ahead(
             continue
         u = (x * R[0, 0] + y * R[1, 0] + z * R[2, 0]) / depth
         v = (x * R[0, 1] + y * R[1, 1] + z * R[2, 1]) / depth
-        if u * u + v * v < square:
+        if left <= u <= right and top <= v <= bottom and u * u + v * v < square:
             rows[count], normalized[count, 0], normalized[count, 1] = j, u, v
             count += 1
     return count
@@ -76,6 +79,7 @@ def points_ahead_numpy(
     centre: FloatArray,
     nearest: float,
     square: float,
+    bounds: FloatArray,
     rows: IntArray,
     normalized: FloatArray,
 ) -> int:
@@ -84,6 +88,7 @@ def points_ahead_numpy(
     ahead = np.flatnonzero(used & (in_camera[:, 2] > nearest))
     found = in_camera[ahead, :2] / in_camera[ahead, 2:]
     inside = np.sum(found**2, axis=1) < square
+    inside &= ((bounds[0] <= found) & (found <= bounds[1])).all(axis=1)
     count = int(np.count_nonzero(inside))
     rows[:count], normalized[:count] = ahead[inside], found[inside]
     return count

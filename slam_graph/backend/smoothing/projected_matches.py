@@ -149,6 +149,8 @@ _MAX_PROJECTION_SIGMAS = 1.5
 """Projections of larger uncertainty are not used, in σ of the observations."""
 _MIN_DEPTH_M = 0.1
 """Points nearer to the camera are not projected."""
+_STRETCH = 4.0
+"""Normalised points are at most so many times as far apart as pixels at the axis would say."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -235,13 +237,16 @@ def _around(
     centre = at.positions[frame] + at.rotations[frame] @ projection.body_p_camera[camera]
     used = scene.usable.copy()
     used[seen.feature[rows]] = False
+    lens, places = projection.cameras[camera], seen.normalized[rows]
     # a distortion model is valid as far from the axis as features are seen
-    square = float(np.max(np.sum(seen.normalized[rows] ** 2, axis=1)))
+    square = float(np.max(np.sum(places**2, axis=1)))
+    wide = math.inf if lens.model.sees_sideways else _STRETCH * around_px / min(lens.fx, lens.fy)
+    bounds = np.stack([places.min(axis=0) - wide, places.max(axis=0) + wide])
     others, normalized = np.empty(len(used), np.int64), np.empty((len(used), 2))
     count = points_ahead(
-        at.points, used, world_R_camera, centre, _MIN_DEPTH_M, square, others, normalized
+        at.points, used, world_R_camera, centre, _MIN_DEPTH_M, square, bounds, others, normalized
     )
-    pixels = projection.cameras[camera].pixels(normalized[:count])
+    pixels = lens.pixels(normalized[:count])
     rows = rows[scene.usable[seen.feature[rows]]]
     near, hit = near_pairs(seen.pixels[rows], pixels, around_px).T
     rows = rows[near]
