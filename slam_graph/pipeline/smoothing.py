@@ -15,6 +15,7 @@ from slam_graph.errors import SlamGraphError
 from slam_graph.pipeline.observers import Progress
 from slam_graph.pipeline.stage import COMPLETED, EstimatedFrame, Stage, warn_on_failure
 from slam_graph.results import RunResult
+from slam_graph.results.free_memory import give_back
 
 _SMOOTHED = (*COMPLETED, "diverged")
 """Run statuses after which the recording is bundle adjusted (not after Ctrl-C)."""
@@ -76,6 +77,7 @@ class Smoothing(Stage):
             return
         with warn_on_failure(self._diagnostics, "final_ba_failed", _FAILED):
             self._recording.close()
+            give_back()  # what the run has freed: the adjustment takes tens of MB
             self._solve(self._log)
 
     def _solve(self, log: backend.FrameLog) -> None:
