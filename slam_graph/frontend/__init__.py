@@ -15,7 +15,6 @@ __all__ = [
     "Feedback",
     "Frontend",
     "FrontendConfig",
-    "Image",
     "Keypoints",
     "build_frontend",
 ]
@@ -30,7 +29,7 @@ if TYPE_CHECKING:
         FrontendConfig,
     )
     from slam_graph.frontend.frontend_protocol import Feedback, Frontend, build_frontend
-    from slam_graph.frontend.keypoints import Image, Keypoints
+    from slam_graph.frontend.keypoints import Keypoints
 else:
     __getattr__, __dir__ = lazy_exports(
         __name__,
@@ -39,6 +38,6 @@ else:
             "detectors": ("Detector",),
             "frontend_config": ("DESCRIPTORS", "DETECTORS", "FRONTENDS", "FrontendConfig"),
             "frontend_protocol": ("Feedback", "Frontend", "build_frontend"),
-            "keypoints": ("Image", "Keypoints"),
+            "keypoints": ("Keypoints",),
         },
     )

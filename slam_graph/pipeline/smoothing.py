@@ -12,10 +12,10 @@ from tempfile import TemporaryDirectory
 from slam_graph import backend
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import SlamGraphError
+from slam_graph.free_memory import give_back
 from slam_graph.pipeline.observers import Progress
 from slam_graph.pipeline.stage import COMPLETED, EstimatedFrame, Stage, warn_on_failure
 from slam_graph.results import RunResult
-from slam_graph.results.free_memory import give_back
 
 _SMOOTHED = (*COMPLETED, "diverged")
 """Run statuses after which the recording is bundle adjusted (not after Ctrl-C)."""

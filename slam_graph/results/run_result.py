@@ -18,10 +18,10 @@ from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.config import RunConfig
 from slam_graph.datasets import kalibr_text
 from slam_graph.errors import DataError, EstimationError
+from slam_graph.free_memory import give_back
 from slam_graph.geometry import AlignmentMode, StateHistory, Trajectory
 from slam_graph.results import metrics as tables
 from slam_graph.results import result_files as names
-from slam_graph.results.free_memory import give_back
 from slam_graph.results.localization_result import LocalizationLog
 from slam_graph.results.map_output import PointMap, save_map, write_ply
 from slam_graph.results.object_files import objects_table, save_objects

@@ -3,10 +3,10 @@
 """How far the bundle adjustment of a recording is, as a number of keyframes.
 
 Nobody knows how many steps a minimisation will take. The number of minimisations is known better:
-rounds of fusion, one with outliers, one without, one with correlated errors of tracks, and steps
-that learn the noise of the IMU. Each has the same share, of which every step takes a fixed part of
-what is left. So the progress never stands still, never goes back, and reaches the end only at the
-end.
+rounds of fusion, one with outliers if there is need, one without, one with correlated errors of
+tracks, and steps that learn the noise of the IMU. Each has the same share, of which every step
+takes a fixed part of what is left. So the progress never stands still, never goes back, and reaches
+the end only at the end.
 """
 
 from __future__ import annotations

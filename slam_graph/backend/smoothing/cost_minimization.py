@@ -30,8 +30,8 @@ _CONTRACTION = 0.2
 """An earlier factor is kept only as long as each step lowers the cost by less than this part of
 what the step before did."""
 _CAUTION = 0.01
-"""Steps by an earlier factor converge linearly. They end where those that would follow lower the
-cost by less than this part of what a new factor's last step may."""
+"""Steps by an earlier factor converge linearly. They end when the steps that would follow,
+contracting as the last two did, would lower the cost by less than this part of the tolerance."""
 
 
 def minimized(

@@ -77,14 +77,26 @@ class _LinearImages:
         if linear.fixes is not None and fixes is not None:
             by_pose, self._by_fixes = linear.fixes.gradient(keyframes)
             self.gradient += fixes.reduced(by_pose, self._by_fixes)
-        self._moved = np.zeros((keyframes, STATE))
+        self._at_minimum, self._moved = self.gradient.copy(), np.zeros((keyframes, STATE))
+
+    def reset(self) -> None:
+        """Go back to the minimum."""
+        self.gradient, self._moved = self._at_minimum.copy(), np.zeros(self._moved.shape)
 
     def factor(self, chain: ChainEquations) -> EliminatedStates:
         """The factor of the states with all other factors."""
         return EliminatedStates(self.features.poses.copy(), chain)
 
     def step(self, states: EliminatedStates, chain: ChainEquations) -> FloatArray:
-        """Moves by a Gauss-Newton step: the increments (K, 15) of the states."""
+        """Moves by a Gauss-Newton step.
+
+        Args:
+            states: the factor of the states.
+            chain: the other factors, linearised at the states that were moved to.
+
+        Returns:
+            The increments (K, 15) of the states.
+        """
         gradient = chain.gradient.copy()
         gradient[:, :6] += self.gradient
         moved = states.times_covariance(gradient[:, :, None])[:, :, 0]
@@ -155,38 +167,60 @@ def equations_at_minimum(
         RuntimeError: if GTSAM cannot linearise a factor.
         LinAlgError: if the cost does not determine all variables.
     """
-    images, cost, estimates = _LinearImages(found), found.cost, found.estimates
-    inertial, values, given = cost.inertial, estimates.states, factors.noise
-    states: EliminatedStates | None = None
-    known = near or images.factor(_chain(_with_gauge(inertial, factors, values), values))
-    for _ in range(_ROUNDS if learn else 0):
-        assumed = factors.noise
-        if not factors.learn_noise(inertial, values, known.times_covariance):
-            break
-        try:
-            changed = factors.inertial(values)
-            chain = _chain(_with_gauge(changed, factors, values), values)
-            known = images.factor(chain)
-        except (RuntimeError, np.linalg.LinAlgError) as error:
-            logger.info("the noise of the IMU is not learned: %s", error)
-            factors.noise = assumed
-            break
-        values = moved_states(values, images.step(known, chain))
-        inertial, states = changed, known
-        count_step()
-    moved = images.moved(estimates, values)
-    under = cost.with_inertial(_with_gauge(inertial, factors, values))
-    if not under.value(moved) <= under.value(estimates):
-        logger.info("the noise of the IMU is not learned: steps under it raise the cost")
-        images, moved, factors.noise = _LinearImages(found), estimates, given
-        under, states = cost.with_inertial(_with_gauge(cost.inertial, factors, moved.states)), None
-    states = states or images.factor(_chain(under.inertial, moved.states))
+    images, cost, given = _LinearImages(found), found.cost, factors.noise
+    inertial, states, moved = cost.inertial, None, found.estimates
+    if learn:
+        learned = _learned(found, images, near, factors, count_step)
+        if learned is None:
+            factors.noise = given
+            images.reset()
+        else:
+            inertial, states, moved = learned
+    inertial = _with_gauge(inertial, factors, moved.states)
+    states = states or images.factor(_chain(inertial, moved.states))
     fixes, features = None, images.features
     if cost.fixes is not None and features.fixes is not None:
         covariance = features.fixes.covariance(states)
         fixes = cost.fixes.calibration(moved.fixes, covariance)
     kept = ImageEquations(features.poses, images.gradient) if keep else None
-    return EliminatedMinimum(kept, under.inertial, moved.states, states, fixes)
+    return EliminatedMinimum(kept, inertial, moved.states, states, fixes)
+
+
+def _learned(
+    found: Minimum,
+    images: _LinearImages,
+    near: EliminatedStates | None,
+    factors: RecordingFactors,
+    count_step: Callable[[], None],
+) -> tuple[gtsam.NonlinearFactorGraph, EliminatedStates | None, Estimates] | None:
+    """The factors of the IMU under its learned noise, the factor of the states, and the minimum.
+
+    Returns:
+        None if steps under another noise cannot be taken, or raise the cost. The factor of the
+        states is None where the noise is as assumed.
+    """
+    cost, values, inertial = found.cost, found.estimates.states, found.cost.inertial
+    states: EliminatedStates | None = None
+    try:
+        known = near or images.factor(_chain(_with_gauge(inertial, factors, values), values))
+        for _ in range(_ROUNDS):
+            if not factors.learn_noise(inertial, values, known.times_covariance):
+                break
+            inertial = factors.inertial(values)
+            chain = _chain(_with_gauge(inertial, factors, values), values)
+            known = states = images.factor(chain)
+            values = moved_states(values, images.step(known, chain))
+            count_step()
+        if states is None:
+            return inertial, None, found.estimates
+        moved = images.moved(found.estimates, values)
+        under = cost.with_inertial(_with_gauge(inertial, factors, found.estimates.states))
+        if under.value(moved) <= under.value(found.estimates):
+            return inertial, states, moved
+        logger.info("the noise of the IMU is not learned: steps under it raise the cost")
+    except (RuntimeError, np.linalg.LinAlgError) as error:
+        logger.info("the noise of the IMU is not learned: %s", error)
+    return None
 
 
 def _chain(inertial: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> ChainEquations:

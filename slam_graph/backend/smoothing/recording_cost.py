@@ -167,6 +167,7 @@ class EliminatedFeatures:
         keyframes: number of keyframes K.
         damping: is added to the diagonal.
         fixes: linearised position fixes with variables of their own; None for none.
+        reduce: whether `poses` is wanted; otherwise it is empty.
 
     Attributes:
         fixes: the factor of these variables, whose remains are in `poses` too.
@@ -280,7 +281,7 @@ class LinearCost:
     fixes: LinearFixes | None = None
 
     def eliminated(self, damping: float = 0.0, reduce: bool = True) -> EliminatedFeatures:
-        """The factor of all but the states; `reduce`: and what it leaves of the poses."""
+        """The factor of all but the states; see `EliminatedFeatures` for `reduce`."""
         keyframes = len(self.chain.gradient)
         return EliminatedFeatures(self.images, keyframes, damping, self.fixes, reduce)
 

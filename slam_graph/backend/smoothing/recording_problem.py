@@ -66,7 +66,7 @@ from slam_graph.geometry import NavState
 logger = logging.getLogger(__name__)
 
 OUTLIER_WIDTH = 3.7
-"""Observations with a larger whitened residual after the first minimum are outliers (the 99.9 %
+"""Observations with a larger whitened residual near the minimum are outliers (the 99.9 %
 circle)."""
 _MIN_KEYFRAMES = 3
 """A feature must be seen in this many keyframes."""
@@ -74,7 +74,7 @@ _MIN_SIGMA_RATIO = 0.1
 """The learned noise of the tracks is at least this part of the configured one."""
 _SAME_FIT = 1.5
 """Poses are near the minimum where the median residual of each keyframe is below this many times
-that of all: then the outliers are the same, and the minimum is a step away."""
+that of all: then outliers are nearly the same, and the minimum is a step away."""
 _LOOSE_TOLERANCE = 1e-3
 """Relative decrease of the cost at which the steps before the last minimum end."""
 
@@ -111,7 +111,7 @@ class BundleAdjustment:
         self._sigma_px, self._inefficiency = backend.noise.pixel_sigma, 1.0
         self._values, self._shared = values_of(start.states), segment.aiding.shared()
         self._given = values_of(start.given or start.states)
-        self._of_others = start.given is not None  # states are a minimum of some of the keyframes
+        self._adjusted = start.given is not None  # to the observations of some of the keyframes
         self._factor: EliminatedStates | None = None
         self._note_motions()
 
@@ -121,17 +121,19 @@ class BundleAdjustment:
         return self._factors.noise
 
     def solve(self) -> AdjustedSegment:
-        """Minimise, remove outliers, and minimise again.
+        """Go near the minimum, remove outliers, and minimise.
 
         Raises:
             EstimationError: if there is no minimum.
         """
         keyframes = self._segment.keyframes
         points, good = self._triangulated(self._candidates)
-        if not self._of_others or not self._fits_alike(self._candidates.subset(good), points[good]):
+        if not self._adjusted or not self._fits_alike(self._candidates.subset(good), points[good]):
             self._minimize_loosely()
             points, good = self._triangulated(self._candidates)
             points, good = self._with_estimates(self._candidates, points, good)
+        else:
+            self._passes += 1  # which is left out
         self._note_motions()
         if self._config.learn_pixel_sigma:
             self._learn_pixel_sigma(self._candidates.subset(good), points[good])
@@ -154,7 +156,7 @@ class BundleAdjustment:
             pixel_sigma=self._sigma_px,
             inefficiency=self._inefficiency,
         )
-        aligned, equations = None, None
+        aligned, equations, assumed = None, None, self._factors.noise
         try:
             equations = self._equations()
             covariances, self._values = equations.covariances(), equations.minimum.values
@@ -163,6 +165,7 @@ class BundleAdjustment:
         except (RuntimeError, np.linalg.LinAlgError) as error:
             logger.info("no covariances: %s", " ".join(str(error).split())[:200])
             states, equations = self._states(self._segment.stamps_ns), None
+            self._factors.noise = assumed
         figures = replace(figures, iterations=self.iterations)
         kept = equations if self._task.joint else None
         fixes = None if equations is None else equations.minimum.fixes
@@ -197,18 +200,21 @@ class BundleAdjustment:
         return points, good | known
 
     def _fits_alike(self, obs: Observations, points: FloatArray) -> bool:
-        """Whether the observations of each keyframe fit its pose as well as those of the others."""
+        """Whether the observations of each keyframe fit its pose as well as those of the others.
+
+        A keyframe none of whose features has a point may be far off.
+        """
         at = Geometry(*stacked_poses(self._values, obs.frames), points)
         lengths = np.linalg.norm(self._projection.residuals(obs, at)[0], axis=1)
-        if len(lengths) == 0:
+        frames, counts = np.unique(obs.frame, return_counts=True)
+        if len(frames) == 0 or len(frames) < len(np.unique(self._candidates.frame)):
             return False
-        counts = np.bincount(obs.frame)
         middle = np.cumsum(counts) - counts + counts // 2
-        medians = lengths[np.lexsort((lengths, obs.frame))][middle[counts > 0]]
+        medians = lengths[np.lexsort((lengths, obs.frame))][middle]
         return bool(np.all(medians < _SAME_FIT * np.median(lengths)))
 
     def _learn_pixel_sigma(self, obs: Observations, points: FloatArray) -> None:
-        """Estimate the noise of the tracks from the median of their residuals at the minimum.
+        """Estimate the noise of the tracks from the median of their residuals near the minimum.
 
         The median is robust to outliers. A residual of standard deviation σ on both axes has the
         median length 1.1774 σ (Rayleigh); at the minimum the residuals have lost as many degrees of
@@ -335,9 +341,14 @@ class BundleAdjustment:
             RuntimeError: if GTSAM cannot linearise a factor.
             LinAlgError: if the minimum does not determine all variables.
         """
-        found, config = (self._minimum, self._factor, self._factors), self._config
+        near, self._factor = self._factor, None  # it is large
         minimum = equations_at_minimum(
-            *found, config.learn_imu_noise, self._task.joint, self._count_step
+            self._minimum,
+            near,
+            self._factors,
+            self._config.learn_imu_noise,
+            self._task.joint,
+            self._count_step,
         )
         densities, level = self._factors.densities(), self._task.rig.has_imu
         stamps_ns, keyframes = self._segment.stamps_ns, self._segment.keyframes
