@@ -15,6 +15,7 @@ __all__ = [
     "Feedback",
     "Frontend",
     "FrontendConfig",
+    "Image",
     "Keypoints",
     "build_frontend",
 ]
@@ -29,7 +30,7 @@ if TYPE_CHECKING:
         FrontendConfig,
     )
     from slam_graph.frontend.frontend_protocol import Feedback, Frontend, build_frontend
-    from slam_graph.frontend.keypoints import Keypoints
+    from slam_graph.frontend.keypoints import Image, Keypoints
 else:
     __getattr__, __dir__ = lazy_exports(
         __name__,
@@ -38,6 +39,6 @@ else:
             "detectors": ("Detector",),
             "frontend_config": ("DESCRIPTORS", "DETECTORS", "FRONTENDS", "FrontendConfig"),
             "frontend_protocol": ("Feedback", "Frontend", "build_frontend"),
-            "keypoints": ("Keypoints",),
+            "keypoints": ("Image", "Keypoints"),
         },
     )

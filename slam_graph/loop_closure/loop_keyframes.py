@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.backend import triangulate_frames
-from slam_graph.frontend import DESCRIPTORS, Keypoints
+from slam_graph.frontend import DESCRIPTORS, Image, Keypoints
 from slam_graph.geometry import Trajectory, interpolate
 from slam_graph.loop_closure.loop_config import KeyframeConfig
 from slam_graph.sensors import Camera, FeatureFrame, FeatureObservations, Rig
@@ -98,7 +98,7 @@ class KeyframeDescriber:
         self._corners = corners
         self._descriptor = DESCRIPTORS["orb"]()
 
-    def describe(self, image: NDArray[np.uint8], seen: FeatureObservations) -> FeatureObservations:
+    def describe(self, image: Image, seen: FeatureObservations) -> FeatureObservations:
         """The tracked features of an image with descriptors, followed by further corners.
 
         Features too close to the border are left out.
@@ -115,7 +115,7 @@ class KeyframeDescriber:
             ids[kept], pixels[kept], normalized[kept], descriptors.astype(np.uint8)
         )
 
-    def _further_corners(self, image: NDArray[np.uint8], taken: FloatArray) -> FloatArray:
+    def _further_corners(self, image: Image, taken: FloatArray) -> FloatArray:
         """Corners (N, 2) away from the features."""
         if self._corners == 0:
             return np.zeros((0, 2))
@@ -155,7 +155,7 @@ class KeyframeLog:
         self._recent: deque[View] = deque(maxlen=POINT_FRAMES)
 
     def add(
-        self, frame: FeatureFrame, world_T_body: gtsam.Pose3, image: NDArray[np.uint8] | None = None
+        self, frame: FeatureFrame, world_T_body: gtsam.Pose3, image: Image | None = None
     ) -> Keyframe | None:
         """Add a frame; returns the keyframe that it becomes, if any.
 

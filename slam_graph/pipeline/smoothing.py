@@ -12,7 +12,6 @@ from tempfile import TemporaryDirectory
 from slam_graph import backend
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import SlamGraphError
-from slam_graph.free_memory import give_back
 from slam_graph.pipeline.observers import Progress
 from slam_graph.pipeline.stage import COMPLETED, EstimatedFrame, Stage, warn_on_failure
 from slam_graph.results import RunResult
@@ -77,7 +76,7 @@ class Smoothing(Stage):
             return
         with warn_on_failure(self._diagnostics, "final_ba_failed", _FAILED):
             self._recording.close()
-            give_back()  # what the run has freed: the adjustment takes tens of MB
+            self._result.give_back_memory()  # the adjustment takes tens of MB
             self._solve(self._log)
 
     def _solve(self, log: backend.FrameLog) -> None:

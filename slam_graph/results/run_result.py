@@ -18,10 +18,10 @@ from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.config import RunConfig
 from slam_graph.datasets import kalibr_text
 from slam_graph.errors import DataError, EstimationError
-from slam_graph.free_memory import give_back
 from slam_graph.geometry import AlignmentMode, StateHistory, Trajectory
 from slam_graph.results import metrics as tables
 from slam_graph.results import result_files as names
+from slam_graph.results.free_memory import give_back
 from slam_graph.results.localization_result import LocalizationLog
 from slam_graph.results.map_output import PointMap, save_map, write_ply
 from slam_graph.results.object_files import objects_table, save_objects
@@ -376,6 +376,11 @@ class RunResult(RunSummary):
         from slam_graph.results.snapshot import save_so_far
 
         save_so_far(self, Path(folder), wall_s)
+
+    @staticmethod
+    def give_back_memory() -> None:
+        """Give memory that was freed back to the system, before what takes much of it."""
+        give_back()
 
     def _known_map(self) -> SlamMap | None:
         return self.slam_map

@@ -8,8 +8,8 @@ from dataclasses import replace
 from pathlib import Path
 
 from slam_graph.datasets import kalibr_text
-from slam_graph.free_memory import give_back
 from slam_graph.results import result_files as names
+from slam_graph.results.free_memory import give_back
 from slam_graph.results.map_output import PointMap, write_ply
 from slam_graph.results.result_files import ResultFolder
 from slam_graph.results.run_input import Ending

@@ -7,8 +7,6 @@ from __future__ import annotations
 import ctypes
 import sys
 
-__all__ = ["give_back"]
-
 
 def give_back() -> None:
     """Give free memory back to the system, where the C library is glibc.
