@@ -17,11 +17,13 @@ from slam_graph.backend.smoothing.cost_minimization import minimized
 from slam_graph.backend.smoothing.final_adjustment import adjust_recording
 from slam_graph.backend.smoothing.frame_log import FrameLog
 from slam_graph.backend.smoothing.keyframe_states import states_at
-from slam_graph.backend.smoothing.recording_cost import Estimates, RecordingCost
+from slam_graph.backend.smoothing.learned_imu_noise import Minimum, _LinearImages
+from slam_graph.backend.smoothing.recording_cost import Estimates, RecordingCost, moved_states
 from slam_graph.backend.smoothing.recording_problem import BundleAdjustment
 from slam_graph.backend.smoothing.recording_segment import read_segment
 from slam_graph.backend.smoothing.smoothing_config import FinalBaConfig
 from slam_graph.backend.smoothing.smoothing_task import SegmentStart, SmoothingTask
+from slam_graph.backend.smoothing.state_elimination import ChainEquations
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import DataError
 from slam_graph.sensors import FeatureFrame, ImuBuffer, ImuData, Packet
@@ -29,6 +31,7 @@ from slam_graph.simulation import simulate
 from slam_graph.simulation.simulated_sequence import SimulatedSequence
 
 FIRST, STOP = 7, 31
+CONFIG = FinalBaConfig(fuse_features=False, robust_loss="none")
 
 
 @pytest.fixture(scope="module")
@@ -151,9 +154,9 @@ def test_a_recording_read_once_is_whole_and_counts_its_faults_for_each_run(
     assert recording.reads == 3
 
 
-def test_a_step_lowers_the_cost_by_what_it_predicts(
-    log: FrameLog, flight: SimulatedSequence, monkeypatch: pytest.MonkeyPatch
-) -> None:
+@pytest.fixture(scope="module")
+def minimum(log: FrameLog, flight: SimulatedSequence) -> tuple[RecordingCost, Estimates]:
+    """The last cost of an adjustment without a robust loss, and where it is least."""
     minima: list[tuple[RecordingCost, Estimates]] = []
 
     def noted(cost: RecordingCost, *given: object) -> object:
@@ -161,12 +164,19 @@ def test_a_step_lowers_the_cost_by_what_it_predicts(
         minima.append((cost, end))
         return end, *others
 
-    monkeypatch.setattr(recording_problem, "minimized", noted)
-    config = FinalBaConfig(fuse_features=False, robust_loss="none")
     truth = flight.groundtruth()
-    adjusted = adjust_recording(log, truth, flight.rig, BackendConfig(), config, lambda *_: None)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(recording_problem, "minimized", noted)
+        given = log, truth, flight.rig, BackendConfig(), CONFIG
+        adjusted = adjust_recording(*given, lambda *_: None)
     assert adjusted is not None
-    cost, end = minima[-1]
+    return minima[-1]
+
+
+def test_a_step_lowers_the_cost_by_what_it_predicts(
+    minimum: tuple[RecordingCost, Estimates],
+) -> None:
+    cost, end = minimum
     moved = np.random.default_rng(0).normal(0.0, 0.01, end.points.shape)
     away = replace(end, points=end.points + moved)
     linear = cost.linearized(away)
@@ -178,8 +188,30 @@ def test_a_step_lowers_the_cost_by_what_it_predicts(
     again = factor.renewed(linear, 0.0).step(linear)
     assert np.allclose(again.states, step.states, rtol=0.0, atol=1e-9)
     assert np.allclose(again.points, step.points, rtol=0.0, atol=1e-9)
+    nearer = away.moved(step)
+    elsewhere, there = cost.linearized(nearer), cost.value(nearer)
+    anew = factor.renewed(elsewhere, 0.0).step(elsewhere)
+    gains = [there - cost.value(nearer.moved(s)) for s in (anew, factor.step(elsewhere))]
+    assert gains[0] > 0.0
+    assert gains[0] > gains[1]
     at_end = cost.linearized(end)
-    assert at_end.factor(0.0).step(at_end).predicted < config.tolerance * cost.value(end)
+    assert at_end.factor(0.0).step(at_end).predicted < CONFIG.tolerance * cost.value(end)
+
+
+def test_reduced_equations_follow_the_states(minimum: tuple[RecordingCost, Estimates]) -> None:
+    """With features where they are best, as the cost linearised again says."""
+    cost, end = minimum
+    images = _LinearImages(Minimum(cost, end))
+    chain = ChainEquations.of(cost.inertial.linearize(end.states), cost.keyframes)
+    push = np.random.default_rng(1).normal(0.0, 10.0, chain.gradient.shape)
+    before = images.gradient.copy()
+    moved = images.step(images.factor(chain), replace(chain, gradient=push))
+    there = images.moved(end, moved_states(end.states, moved))
+    again = _LinearImages(Minimum(cost, there)).gradient
+    change = np.linalg.norm(images.gradient - before)
+    assert np.linalg.norm(images.gradient - again) < 0.02 * change  # the cost is curved
+    images.reset()
+    assert np.array_equal(images.gradient, before)
 
 
 def test_a_keyframe_that_is_off_is_moved_before_outliers_are_judged(

@@ -32,7 +32,7 @@ from typing import Any
 import gtsam
 import numpy as np
 
-from slam_graph.arrays import FloatArray
+from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.backend.cost.adaptive_imu_noise import MAX_FACTOR
 from slam_graph.backend.smoothing.state_elimination import STATE
 from slam_graph.sensors import ImuNoise
@@ -140,22 +140,45 @@ def variance_ratios(
     S = 0.5 * (white[:, None] * _KINDS[:, None, :]) @ L[:, None]  # (M, kinds, 15, 15)
     S += S.transpose(0, 1, 3, 2)
     signs = np.random.default_rng(0).choice([-1.0, 1.0], (len(factors), 1, S.shape[2], _PROBES))
-    u = S @ signs
     first = np.array([gtsam.symbolIndex(factor.keys()[0]) for factor in factors])
-    pairs = W.transpose(0, 2, 1)[:, None] @ u  # (M, kinds, 30, probes), of states k and k + 1
-    states = pairs.transpose(0, 2, 1, 3).reshape(len(factors), 2, STATE, -1)
-    right = np.zeros((keyframes, STATE, states.shape[3]))
-    np.add.at(right, first, states[:, 0])
-    np.add.at(right, first + 1, states[:, 1])
-    solved = times_covariance(right)
-    moved = np.concatenate([solved[first], solved[first + 1]], axis=1)
-    u -= (W @ moved).reshape(len(factors), -1, len(_KINDS), _PROBES).transpose(0, 2, 1, 3)
+    given = S @ signs
+    u = given - _explained(given, W, first, keyframes, times_covariance)
     F = np.einsum("mkap,mlap->kl", u, S @ u.sum(axis=1, keepdims=True)) / _PROBES
     F = 0.5 * (F + F.T) + _PRIOR_INFORMATION * np.eye(len(F))
     redundancy = np.einsum("map,mkap->k", signs[:, 0], u) / _PROBES
     squares = np.einsum("ma,mkab,mb->k", e, S, e)
     ratios = 1.0 + np.linalg.solve(F, squares - redundancy)
     return np.asarray(np.clip(ratios, 1.0 / _LARGEST_RATIO, _LARGEST_RATIO))
+
+
+def _explained(
+    given: FloatArray,
+    W: FloatArray,
+    first: IntArray,
+    keyframes: int,
+    times_covariance: TimesCovariance,
+) -> FloatArray:
+    """W P Wᵀ of whitened residuals: what the states explain of them.
+
+    Args:
+        given: (M, kinds, 15, probes) residuals.
+        W: (M, 15, 30) derivatives by the states k and k + 1.
+        first: (M,) the numbers k.
+        keyframes: number of all states.
+        times_covariance: the product of their covariance with what it is given.
+
+    Returns:
+        (M, kinds, 15, probes).
+    """
+    count, kinds, rows, probes = given.shape
+    pairs = (W.transpose(0, 2, 1)[:, None] @ given).transpose(0, 2, 1, 3)
+    pairs = pairs.reshape(count, 2, STATE, kinds * probes)
+    right = np.zeros((keyframes, STATE, kinds * probes))
+    np.add.at(right, first, pairs[:, 0])
+    np.add.at(right, first + 1, pairs[:, 1])
+    solved = times_covariance(right)
+    explained = W @ np.concatenate([solved[first], solved[first + 1]], axis=1)
+    return np.asarray(explained.reshape(count, rows, kinds, probes).transpose(0, 2, 1, 3))
 
 
 def _residuals(

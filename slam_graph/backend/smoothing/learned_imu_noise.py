@@ -73,11 +73,13 @@ class _LinearImages:
         linear, keyframes = found.cost.linearized(found.estimates), found.cost.keyframes
         self.features = linear.eliminated()
         self.gradient, self._t = self.features.reduced(*linear.images.gradient(keyframes))
-        self._by_fixes, fixes = np.zeros(0), self.features.fixes
+        self._by_fixes = np.zeros(0)  # gradient by clock and lever arm of the fixes
+        fixes = self.features.fixes
         if linear.fixes is not None and fixes is not None:
             by_pose, self._by_fixes = linear.fixes.gradient(keyframes)
             self.gradient += fixes.reduced(by_pose, self._by_fixes)
-        self._at_minimum, self._moved = self.gradient.copy(), np.zeros((keyframes, STATE))
+        self._at_minimum = self.gradient.copy()
+        self._moved = np.zeros((keyframes, STATE))  # increments of the states so far
 
     def reset(self) -> None:
         """Go back to the minimum."""
