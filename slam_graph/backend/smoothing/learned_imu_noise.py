@@ -28,7 +28,7 @@ from slam_graph.sensors import AidingData
 
 logger = logging.getLogger(__name__)
 
-_ROUNDS = 2
+_ROUNDS = 3
 """The noise is estimated this many times at most, each at the minimum under the last estimate."""
 
 
