@@ -22,6 +22,12 @@ from slam_graph.kernels.epipolar import (
     sampson_distances,
     sampson_distances_numpy,
 )
+from slam_graph.kernels.epipolar_pairs import (
+    epipolar_distances,
+    epipolar_distances_numpy,
+    epipolar_moments,
+    epipolar_moments_numpy,
+)
 from slam_graph.kernels.epipolar_rotation import _median, refine_rotation
 from slam_graph.kernels.epipolar_rotation_numpy import refine_rotation_numpy
 from slam_graph.kernels.feature_elimination import (
@@ -359,6 +365,46 @@ def test_chain_turns(count: int) -> None:
     chain_turns(turns, found[0])
     chain_turns_numpy(turns, found[1])
     assert same(*found)
+
+
+@pytest.mark.parametrize("features", [0, 7])
+def test_epipolar_distances_and_moments(features: int) -> None:
+    rng = np.random.default_rng(11)
+    pairs = 4
+    bearings = rng.normal(size=(2, pairs, features, 3))
+    by_pixels = rng.normal(size=(2, pairs, features, 2, 3))
+    R = Rotation.random(pairs, rng=rng).as_matrix()
+    seen = *bearings, *by_pixels, R
+    t, least = rng.normal(size=(pairs, 3)), rng.uniform(0.0, 3.0, (pairs, features))
+    distances = []
+    for kernel, slopes in (
+        (epipolar_distances, np.empty(bearings[0].shape)),
+        (epipolar_distances_numpy, np.empty(bearings[0].shape)),
+        (epipolar_distances, np.empty((0, 0, 0))),
+    ):
+        distances.append([np.empty(least.shape), np.empty(least.shape), slopes])
+        kernel(*seen, t, least, *distances[-1])
+    assert all(same(a, b) for a, b in zip(*distances[:2], strict=True))
+    assert all(np.array_equal(a, b) for a, b in zip(distances[0][:2], distances[2], strict=False))
+    weights, by_noise = rng.uniform(size=(2, pairs, features)) * (rng.uniform(size=features) > 0.2)
+    for alike in False, True:
+        moments = np.empty((2, pairs, 3, 3))
+        epipolar_moments(*seen, weights, by_noise, alike, moments[0])
+        epipolar_moments_numpy(*seen, weights, by_noise, alike, moments[1])
+        assert same(*moments)
+
+
+def test_epipolar_distances_have_their_derivatives() -> None:
+    rng = np.random.default_rng(12)
+    seen = *rng.normal(size=(2, 1, 5, 3)), *rng.normal(size=(2, 1, 5, 2, 3)), np.eye(3)[None]
+    t, slopes, step = rng.normal(size=(1, 3)), np.empty((1, 5, 3)), 1e-6
+    e, sigmas = np.empty((2, 3, 1, 5)), np.empty((1, 5))
+    for side, sign in enumerate((-1.0, 1.0)):
+        for c, change in enumerate(step * np.eye(3)):
+            moved = t + sign * change
+            epipolar_distances(*seen, moved, np.zeros((1, 5)), e[side, c], sigmas, slopes)
+    epipolar_distances(*seen, t, np.zeros((1, 5)), np.empty((1, 5)), sigmas, slopes)
+    np.testing.assert_allclose(slopes[0], (e[1] - e[0])[:, 0].T / (2.0 * step), atol=1e-7)
 
 
 def test_epipolar_constraint() -> None:

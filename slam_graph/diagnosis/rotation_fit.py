@@ -16,7 +16,6 @@ neighbouring pairs.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -26,6 +25,7 @@ from slam_graph.diagnosis.frame_pairs import FramePair
 from slam_graph.diagnosis.gyroscope import Gyroscope
 from slam_graph.diagnosis.jackknife import jackknife_covariance
 from slam_graph.diagnosis.kinematics import Kinematics
+from slam_graph.kernels.epipolar_pairs import epipolar_distances, epipolar_moments
 from slam_graph.sensors import RigCamera
 
 UNKNOWNS = ("offset", "focal", "readout", "rx", "ry", "rz", "bx", "by", "bz")
@@ -50,8 +50,6 @@ _BEYOND = 10.0
 """Epipolar distance of a feature beyond the edge of a wide lens, in units of the noise."""
 _LEAST_PX = 0.05
 """No noise is smaller than this."""
-_PIXEL_STEPS = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
-"""Pixels moved for the derivatives of bearings."""
 _LEAST_VARIANCE, _POSITIVE = 0.01, 1e-12
 """Of t · n, as a part of the largest one: towards an epipole distances tell nothing. And what is
 added to it."""
@@ -90,11 +88,12 @@ class RotationFit:
 
 @dataclass(frozen=True, eq=False)
 class _Turned:
-    """Bearings of both frames of P pairs in the camera of the first one; features are last.
+    """What P pairs of frames with N features see, and how the camera turns between them.
 
     Attributes:
-        one, two: (P, 3, N) bearings f₁ and R f₂.
-        by_one, by_two: (P, 2, 3, N) their derivatives by the pixels.
+        one, two: (P, N, 3) bearings f₁ and f₂, each in its own camera.
+        by_one, by_two: (P, N, 2, 3) their derivatives by the pixels.
+        R: (P, 3, 3) first_R_second of the camera.
         least: (P, N) variance of t · n that is assumed at least, for pixels with unit noise.
     """
 
@@ -102,37 +101,33 @@ class _Turned:
     two: FloatArray
     by_one: FloatArray
     by_two: FloatArray
+    R: FloatArray
     least: FloatArray
 
-    @cached_property
-    def normals(self) -> FloatArray:
-        """(P, 3, N) f₁ × R f₂ of the features."""
-        return _cross(self.one, self.two)
+    def direction(
+        self, weights: FloatArray, by_noise: FloatArray, alike: bool = False
+    ) -> FloatArray:
+        """Directions (P, 3) along which second moments of the normals are least.
 
-    @cached_property
-    def spread(self) -> FloatArray:
-        """(P, 3, 4 N) how normals change with each of the four coordinates of both pixels."""
-        one, two = self.one[:, None], self.two[:, None]
-        parts = np.concatenate([_cross(self.by_one, two), _cross(one, self.by_two)], axis=1)
-        return parts.transpose(0, 2, 1, 3).reshape(len(parts), 3, -1)
+        Arguments are those of `epipolar_moments`.
+        """
+        moments = np.empty(self.R.shape)
+        seen = self.one, self.two, self.by_one, self.by_two, self.R
+        epipolar_moments(*seen, weights, by_noise, alike, moments)
+        return np.asarray(np.linalg.eigh(moments)[1][:, :, 0])
 
-    def moments(self, weights: FloatArray) -> FloatArray:
-        """Weighted sum (P, 3, 3) of the covariances of the normals for pixels with unit noise."""
-        return _scatter(self.spread, np.tile(weights, 4))
+    def distances(
+        self, t: FloatArray, with_slopes: bool = False
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Epipolar distances (P, N), pixels, and the deviations of t · n that they are units of.
 
-    def distances(self, t: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Epipolar distances (P, N), pixels, and the deviations of t · n that they are units of."""
-        sigma = np.sqrt(np.maximum(np.sum(self._along(t) ** 2, axis=1), self.least))
-        return (t[:, None] @ self.normals)[:, 0] / sigma, sigma
-
-    def variance_slopes(self, t: FloatArray) -> FloatArray:
-        """(P, 3, N) half the derivatives of the variances of t · n by t."""
-        spread = self.spread.reshape(len(t), 3, 4, -1)
-        return np.asarray(np.sum(spread * self._along(t)[:, None], axis=2))
-
-    def _along(self, t: FloatArray) -> FloatArray:
-        """(P, 4, N) how t · n changes with each of the four coordinates of both pixels."""
-        return np.asarray((t[:, None] @ self.spread).reshape(len(t), 4, -1))
+        Then their derivatives (P, N, 3) by the directions t (P, 3), if they are asked for.
+        """
+        e, sigma = np.empty(self.least.shape), np.empty(self.least.shape)
+        slopes = np.empty(self.one.shape if with_slopes else (0, 0, 0))
+        seen = self.one, self.two, self.by_one, self.by_two, self.R
+        epipolar_distances(*seen, np.ascontiguousarray(t), self.least, e, sigma, slopes)
+        return e, sigma, slopes
 
 
 class RotationProblem:
@@ -166,28 +161,24 @@ class RotationProblem:
         self._latest: tuple[Kinematics, _Turned] | None = None
 
     def bearings(self, focal: float) -> tuple[FloatArray, FloatArray, FloatArray, BoolArray]:
-        """Unit bearings (2, P, 3, N) with a factor on the focal lengths, and their derivatives.
+        """Unit bearings (2, P, N, 3) with a factor on the focal lengths, and their derivatives.
 
-        The derivatives (2, P, 2, 3, N) are by the pixels. Then the least variance (P, N) of t · n,
+        The derivatives (2, P, N, 2, 3) are by the pixels. Then the least variance (P, N) of t · n,
         and which features (P, N) have both bearings: beyond the edge of a wide lens there is none.
         """
         if focal not in self._bearings:
             camera = self._mounted.camera
             scaled = replace(camera, fx=camera.fx * focal, fy=camera.fy * focal)
-            moved = self._pixels + _PIXEL_STEPS[:, None]
-            points, visible = scaled.visible(moved.reshape(-1, 2))
-            x, y = np.moveaxis(points.reshape(moved.shape), -1, 0)
-            rays = np.stack([x, y, np.ones_like(x)], axis=1) / np.sqrt(x**2 + y**2 + 1.0)[:, None]
-            slopes = rays[1:] - rays[0]
-            squares = np.sum(slopes**2, axis=(0, 1))[self._place].sum(axis=0)
-            known = np.all(visible.reshape(x.shape), axis=0)[self._place]
+            points, visible = scaled.visible(self._pixels)
+            rays, slopes = _rays(points, scaled.distort(points)[1])
+            squares = np.sum(slopes**2, axis=(1, 2))[self._place].sum(axis=0)
             if len(self._bearings) > 4:
                 self._bearings.clear()
             self._bearings[focal] = (
-                np.moveaxis(rays[0][:, self._place], 0, 2),
-                np.moveaxis(slopes[:, :, self._place], (0, 1), (2, 3)),
+                rays[self._place],
+                slopes[self._place],
                 _LEAST_VARIANCE * squares + _POSITIVE,
-                self._there & known.all(axis=0),
+                self._there & visible[self._place].all(axis=0),
             )
         return self._bearings[focal]
 
@@ -206,14 +197,13 @@ class RotationProblem:
         C, (body, halfway, rates) = at.body_R_camera, self._gyroscope_turns(at.offset_s)
         if at.readout_s != 0.0:
             seconds, rates = self._row * at.readout_s, (rates - at.bias) / at.scale
-            f = f + skew(rates @ C) @ f * seconds[:, :, None]
+            f = f - f @ skew(rates @ C) * seconds[..., None]
         by_bias = (at.bias * (self._t[1] - self._t[0])[:, None])[..., None]
         body = body @ Rotation.from_rotvec(-(halfway @ by_bias)[..., 0]).as_matrix()
         if at.scale != 1.0:
             body = Rotation.from_rotvec(Rotation.from_matrix(body).as_rotvec() / at.scale)
             body = body.as_matrix()
-        camera = C.T @ body @ C
-        return _Turned(f[0], camera @ f[1], slopes[0], camera[:, None] @ slopes[1], least)
+        return _Turned(f[0], f[1], slopes[0], slopes[1], C.T @ body @ C, least)
 
     def _gyroscope_turns(self, offset_s: float) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Rotations (P, 3, 3) from the second body of each pair to the first, by the gyroscope.
@@ -238,14 +228,13 @@ class RotationProblem:
     def directions(self, at: Kinematics, noise: float) -> FloatArray:
         """Directions (P, 3) of the translations that fit best, robustly."""
         turned, known = self._turned(at), self.bearings(at.focal)[3]
-        weights = known / np.maximum(np.sum(turned.normals**2, axis=1), 1e-6)
-        t = _least(_scatter(turned.normals, weights))
+        weights = known.astype(np.float64)
+        t = turned.direction(weights, np.zeros(known.shape), alike=True)
         for _ in range(_DIRECTIONS):
-            e, sigma = turned.distances(t)
+            e, sigma, _ = turned.distances(t)
             scale = np.maximum(_scales(np.abs(e), known), noise)[:, None]
             weights = known / (1.0 + (e / (_CAUCHY * scale)) ** 2) / sigma**2
-            by_noise = turned.moments(weights * e**2)
-            t = _least(_scatter(turned.normals, weights) - by_noise)
+            t = turned.direction(weights, weights * e**2)
         return t
 
     def distances(self, at: Kinematics, t: FloatArray) -> FloatArray:
@@ -254,11 +243,8 @@ class RotationProblem:
 
     def residuals(self, at: Kinematics, t: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Epipolar distances (P, N), pixels, and their derivatives (P, 2, N) by the directions."""
-        turned, tangents = self._turned(at), _tangents(t).transpose(0, 2, 1)
-        e, sigma = turned.distances(t)
-        by_sigma = tangents @ turned.variance_slopes(t)
-        by_t = tangents @ turned.normals / sigma[:, None]
-        return e, by_t - by_sigma * (e / sigma**2)[:, None]
+        e, _, slopes = self._turned(at).distances(t, with_slopes=True)
+        return e, (slopes @ _tangents(t)).transpose(0, 2, 1)
 
     def noise_px(self, at: Kinematics) -> float:
         """Robust standard deviation of the epipolar distances, the directions fitted."""
@@ -356,21 +342,23 @@ class RotationProblem:
         return information, scores
 
 
-def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
-    """The products a × b of vectors (..., 3, N)."""
-    x, y, z = (a[..., k, :] for k in range(3))
-    u, v, w = (b[..., k, :] for k in range(3))
-    return np.stack([y * w - z * v, z * u - x * w, x * v - y * u], axis=-2)
+def _rays(points: FloatArray, by_points: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Unit bearings (M, 3) of normalised points (M, 2), and their derivatives (M, 2, 3) by pixels.
 
-
-def _scatter(normals: FloatArray, weights: FloatArray) -> FloatArray:
-    """Weighted second moments (P, 3, 3) of normals (P, 3, N)."""
-    return np.asarray((normals * weights[:, None]) @ normals.transpose(0, 2, 1))
-
-
-def _least(moments: FloatArray) -> FloatArray:
-    """Directions (P, 3) along which second moments (P, 3, 3) are least."""
-    return np.asarray(np.linalg.eigh(moments)[1][:, :, 0])
+    Args:
+        points: the points.
+        by_points: (M, 2, 2) derivatives of the pixels by them.
+    """
+    rays = np.column_stack([points, np.ones(len(points))])
+    lengths = np.linalg.norm(rays, axis=1)
+    rays /= lengths[:, None]
+    (a, b), (c, d) = by_points.transpose(1, 2, 0)
+    scale = 1.0 / ((a * d - b * c) * lengths)  # times the adjugate: an inverse
+    slopes = np.zeros((len(points), 2, 3))
+    slopes[:, 0, 0], slopes[:, 0, 1] = d * scale, -c * scale
+    slopes[:, 1, 0], slopes[:, 1, 1] = -b * scale, a * scale
+    slopes -= (slopes @ rays[:, :, None]) * rays[:, None]
+    return rays, slopes
 
 
 def _scales(sizes: FloatArray, there: BoolArray) -> FloatArray:
