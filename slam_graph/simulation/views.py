@@ -87,7 +87,7 @@ class View:
         near, plane = near[inside], plane[inside]
         facing = np.einsum("ij,ij->i", from_eye[near], normals[near]) <= 0.0
         near, plane = near[facing], plane[facing]
-        pixels = self.camera.distort(plane)[0]
+        pixels = self.camera.pixels(plane)
         inside = self._within_borders(pixels)
         near, pixels = near[inside], pixels[inside]
         clear = ~world.hidden(eye, points[near])
@@ -109,15 +109,15 @@ class View:
         R = world_R_body @ self.body_R_camera
         local = np.einsum("nji,nj->ni", R, points - positions - world_R_body @ self.position)
         plane = local[:, :2] / np.maximum(local[:, 2:], MIN_DEPTH_M)
-        pixels = self.camera.distort(plane)[0]
+        pixels = self.camera.pixels(plane)
         near = np.einsum("ij,ij->i", plane, plane) < self.reach**2
         return pixels, near & (local[:, 2] > MIN_DEPTH_M) & self._within_borders(pixels)
 
     def _within_borders(self, pixels: FloatArray) -> BoolArray:
         """Which pixels (N, 2) are far enough from the border."""
-        low = BORDER_PX
-        high = np.array([self.camera.width - 1 - low, self.camera.height - 1 - low])
-        return np.asarray(np.all((pixels >= low) & (pixels <= high), axis=1))
+        (u, v), low = pixels.T, BORDER_PX
+        within = (u >= low) & (u <= self.camera.width - 1 - low)
+        return np.asarray(within & (v >= low) & (v <= self.camera.height - 1 - low))
 
 
 def _border(camera: Camera) -> FloatArray:
