@@ -85,9 +85,9 @@ class _LinearImages:
         """Go back to the minimum."""
         self.gradient, self._moved = self._at_minimum.copy(), np.zeros(self._moved.shape)
 
-    def factor(self, chain: ChainEquations) -> EliminatedStates:
+    def factor(self, chain: ChainEquations, exact: bool = True) -> EliminatedStates:
         """The factor of the states with all other factors."""
-        return EliminatedStates(self.features.poses.copy(), chain)
+        return EliminatedStates(self.features.poses.copy(), chain, exact=exact)
 
     def step(self, states: EliminatedStates, chain: ChainEquations) -> FloatArray:
         """Moves by a Gauss-Newton step.
@@ -199,26 +199,27 @@ def _learned(
 
     Returns:
         None if steps under another noise cannot be taken, or raise the cost. The factor of the
-        states is None where the noise is as assumed.
+        states is that of the last round; None where fewer were enough.
     """
     cost, values, inertial = found.cost, found.estimates.states, found.cost.inertial
-    states: EliminatedStates | None = None
+    states, rounds = near, 0
     try:
-        known = near or images.factor(_chain(_with_gauge(inertial, factors, values), values))
-        for _ in range(_ROUNDS):
-            if not factors.learn_noise(inertial, values, known.times_covariance):
-                break
+        if states is None:
+            chain = _chain(_with_gauge(inertial, factors, values), values)
+            states = images.factor(chain, exact=False)
+        while rounds < _ROUNDS and factors.learn_noise(inertial, values, states.times_covariance):
+            rounds += 1
             inertial = factors.inertial(values)
             chain = _chain(_with_gauge(inertial, factors, values), values)
-            known = states = images.factor(chain)
-            values = moved_states(values, images.step(known, chain))
+            states = images.factor(chain, exact=rounds == _ROUNDS)
+            values = moved_states(values, images.step(states, chain))
             count_step()
-        if states is None:
+        if rounds == 0:
             return inertial, None, found.estimates
         moved = images.moved(found.estimates, values)
         under = cost.with_inertial(_with_gauge(inertial, factors, found.estimates.states))
         if under.value(moved) <= under.value(found.estimates):
-            return inertial, states, moved
+            return inertial, states if rounds == _ROUNDS else None, moved
         logger.info("the noise of the IMU is not learned: steps under it raise the cost")
     except (RuntimeError, np.linalg.LinAlgError) as error:
         logger.info("the noise of the IMU is not learned: %s", error)

@@ -171,8 +171,7 @@ class EliminatedFeatures:
 
     Attributes:
         fixes: the factor of these variables, whose remains are in `poses` too.
-        poses: (n, n) lower triangle of the information on the poses, in `StateColumns`; until
-            `EliminatedStates` overwrites it.
+        poses: (n, n) lower triangle of the information on the poses, in `StateColumns`.
     """
 
     def __init__(
@@ -285,14 +284,15 @@ class LinearCost:
         keyframes = len(self.chain.gradient)
         return EliminatedFeatures(self.images, keyframes, damping, self.fixes, reduce)
 
-    def factor(self, damping: float) -> Factor:
-        """The factor of the normal equations, damped.
+    def factor(self, damping: float, exact: bool = True) -> Factor:
+        """The factor of the normal equations, damped; see `EliminatedStates` for `exact`.
 
         Raises:
             LinAlgError: if they are not positive definite.
         """
         features = self.eliminated(damping)
-        return Factor(features, EliminatedStates(features.poses, self.chain, damping))
+        poses, features.poses = features.poses, np.zeros((0, 0))  # it is large
+        return Factor(features, EliminatedStates(poses, self.chain, damping, exact))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
