@@ -26,10 +26,10 @@ _DIAGONAL = np.equal(*_UPPER)
 
 
 class StateHistory:
-    """All states of a run, as compact rows: about 0.4 kB a state.
+    """All states of a run, as compact rows: about 0.26 kB a state.
 
     It grows by one state at a time and gives arrays. Where a state has no covariance its rows are
-    NaN.
+    NaN. Covariances are kept with seven digits, as runs may be long.
 
     Attributes:
         level: whether gravity was measured, so that the vertical of its world is known.
@@ -41,11 +41,16 @@ class StateHistory:
         self.level, self.has_scale = level, has_scale
         self._stamps_ns = array("q")
         self._states = GrowingTable(_STATE_WIDTH)
-        self._pose_covariances = GrowingTable(len(_UPPER[0]))  # upper triangles: runs may be long
-        self._other_variances = GrowingTable(_ERROR_WIDTH - _POSE_WIDTH)
+        self._pose_covariances = GrowingTable(len(_UPPER[0]), np.float32)  # upper triangles
+        self._other_variances = GrowingTable(_ERROR_WIDTH - _POSE_WIDTH, np.float32)
 
     def __len__(self) -> int:
         return len(self._stamps_ns)
+
+    @property
+    def _tables(self) -> tuple[GrowingTable, ...]:
+        """All that is kept beside the stamps."""
+        return self._states, self._pose_covariances, self._other_variances
 
     @property
     def free(self) -> AlignmentMode:
@@ -85,15 +90,14 @@ class StateHistory:
     def extend(self, other: StateHistory) -> None:
         """Add all states of another history, which are later."""
         self._stamps_ns.extend(other._stamps_ns)
-        self._states.extend(other._states.rows())
-        self._pose_covariances.extend(other._pose_covariances.rows())
-        self._other_variances.extend(other._other_variances.rows())
+        for own, others in zip(self._tables, other._tables, strict=True):
+            own.extend(others.rows())
 
     def forget_from(self, stamp_ns: int) -> None:
         """Forget the states at and after a time."""
         kept = bisect_left(self._stamps_ns, stamp_ns)
         del self._stamps_ns[kept:]
-        for table in (self._states, self._pose_covariances, self._other_variances):
+        for table in self._tables:
             table.cut(kept)
 
     def trajectory(self) -> Trajectory:
@@ -112,7 +116,7 @@ class StateHistory:
         """(N, 15) standard deviations, in the order of `NavState.COMPONENTS`."""
         poses = self._pose_covariances.rows()[:, _DIAGONAL]
         variances = np.concatenate([poses, self._other_variances.rows()], axis=1)
-        return np.asarray(np.sqrt(np.maximum(variances, 0.0)), dtype=np.float64)
+        return np.asarray(np.sqrt(np.maximum(variances.astype(np.float64), 0.0)))
 
     def pose_covariances(self) -> FloatArray:
         """(N, 6, 6) covariances of rotation and position, in the body frame."""

@@ -85,7 +85,7 @@ class InnovationLog:
     def __init__(self) -> None:
         self._stamps_ns = array("q")
         self._counts = GrowingTable(len(_COUNTS), np.int32)
-        self._sums = GrowingTable(len(_SUMS))
+        self._sums = GrowingTable(len(_SUMS), np.float32)
 
     def __len__(self) -> int:
         return len(self._stamps_ns)
@@ -111,7 +111,7 @@ class InnovationLog:
 
     def columns(self) -> dict[str, FloatArray]:
         """(N,) values of each attribute of `Innovations`, by its name."""
-        counts, sums = self._counts.rows().astype(np.float64), self._sums.rows()
+        counts, sums = (table.rows().astype(np.float64) for table in (self._counts, self._sums))
         columns = dict(zip((*_COUNTS, *_SUMS), (*counts.T, *sums.T), strict=True))
         return {name: columns[name] for name in _KINDS}
 
