@@ -13,10 +13,13 @@ from scipy.spatial.transform import Rotation
 
 from slam_graph.arrays import FloatArray
 from slam_graph.diagnosis.camera_and_gyroscope import refine
+from slam_graph.diagnosis.frame_pairs import FramePair
 from slam_graph.diagnosis.gathering import Part
-from slam_graph.diagnosis.rotation_fit import RotationFit
+from slam_graph.diagnosis.gyroscope import Gyroscope
+from slam_graph.diagnosis.rotation_fit import RotationFit, RotationProblem
+from slam_graph.sensors.camera import Camera
 from slam_graph.sensors.measurements import FeatureFrame, ImuData
-from slam_graph.sensors.rig import Rig
+from slam_graph.sensors.rig import Rig, RigCamera
 from slam_graph.simulation.simulator import simulate
 
 
@@ -47,6 +50,37 @@ def sigmas_away(fit: RotationFit, body_R_camera: FloatArray) -> float:
     """How far a mounting is from the one that was found."""
     turn, covariance = fit.turn_from(body_R_camera)
     return float(np.sqrt(turn @ np.linalg.solve(covariance, turn)))
+
+
+LENSES: dict[str, tuple[float, ...]] = {
+    "none": (),
+    "radtan": (-0.28, 0.07, 2e-3, -3e-3),
+    "equidistant": (-0.01, 0.02, -0.01, 0.002),
+}
+
+
+@pytest.mark.parametrize("model", LENSES)
+def test_bearings_have_the_derivatives_of_the_lens(model: str) -> None:
+    rng, step = np.random.default_rng(0), 1e-3
+    lens = Camera(320.0, 300.0, 310.0, 250.0, model, LENSES[model], 640, 480)
+    mounted = RigCamera(lens, gtsam.Pose3())
+    imu = ImuData(np.arange(3) * 10**8, np.zeros((3, 3)), np.zeros((3, 3)))
+    pixels = rng.uniform([0.0, 0.0], [640.0, 480.0], (2, 9, 2))
+    pixels[0, 0] = 1e4  # may be beyond the edge
+
+    def bearings(first: FloatArray, second: FloatArray) -> tuple[FloatArray, ...]:
+        pair = FramePair(0, 0.0, 0.1, first, second, None)
+        return RotationProblem([pair], [Gyroscope(imu)], mounted).bearings(1.0)
+
+    rays, slopes, _, known = bearings(*pixels)
+    assert np.isfinite(rays).all()
+    assert np.isfinite(slopes).all()
+    assert known[0, 1:].all()
+    assert known[0, 0] or not slopes[0, 0, 0].any()
+    for k in range(2):
+        low, high = (bearings(*(pixels + side * step * np.eye(2)[k]))[0] for side in (-1.0, 1.0))
+        central = (high - low) / (2.0 * step)
+        np.testing.assert_allclose(slopes[:, 0, 1:, k], central[:, 0, 1:], rtol=0.0, atol=1e-8)
 
 
 @pytest.mark.parametrize("seed", [slow(0), 1])

@@ -87,7 +87,7 @@ class RotationFit:
 
 
 @dataclass(frozen=True, eq=False)
-class _Turned:
+class _SeenPairs:
     """What P pairs of frames with N features see, and how the camera turns between them.
 
     Attributes:
@@ -105,7 +105,7 @@ class _Turned:
     least: FloatArray
 
     def direction(
-        self, weights: FloatArray, by_noise: FloatArray, alike: bool = False
+        self, weights: FloatArray, by_noise: FloatArray, normalize: bool = False
     ) -> FloatArray:
         """Directions (P, 3) along which second moments of the normals are least.
 
@@ -113,7 +113,7 @@ class _Turned:
         """
         moments = np.empty(self.R.shape)
         seen = self.one, self.two, self.by_one, self.by_two, self.R
-        epipolar_moments(*seen, weights, by_noise, alike, moments)
+        epipolar_moments(*seen, weights, by_noise, normalize, moments)
         return np.asarray(np.linalg.eigh(moments)[1][:, :, 0])
 
     def distances(
@@ -158,7 +158,7 @@ class RotationProblem:
         self._row = np.where(self._there, rows, 0.0)
         self._bearings: dict[float, tuple[FloatArray, FloatArray, FloatArray, BoolArray]] = {}
         self._turns: dict[float, tuple[FloatArray, FloatArray, FloatArray]] = {}
-        self._latest: tuple[Kinematics, _Turned] | None = None
+        self._latest: tuple[Kinematics, _SeenPairs] | None = None
 
     def bearings(self, focal: float) -> tuple[FloatArray, FloatArray, FloatArray, BoolArray]:
         """Unit bearings (2, P, N, 3) with a factor on the focal lengths, and their derivatives.
@@ -171,6 +171,7 @@ class RotationProblem:
             scaled = replace(camera, fx=camera.fx * focal, fy=camera.fy * focal)
             points, visible = scaled.visible(self._pixels)
             rays, slopes = _rays(points, scaled.distort(points)[1])
+            slopes[~visible] = 0.0  # they are of no pixel
             squares = np.sum(slopes**2, axis=(1, 2))[self._place].sum(axis=0)
             if len(self._bearings) > 4:
                 self._bearings.clear()
@@ -182,17 +183,17 @@ class RotationProblem:
             )
         return self._bearings[focal]
 
-    def _turned(self, at: Kinematics) -> _Turned:
-        """Bearings of both frames, turned into the camera of the first one.
+    def _seen(self, at: Kinematics) -> _SeenPairs:
+        """Bearings of both frames, and the turn between them.
 
         The last ones are kept: a step asks for those at the same values several times.
         """
         if self._latest is None or self._latest[0] is not at:
-            self._latest = at, self._turned_at(at)
+            self._latest = at, self._seen_at(at)
         return self._latest[1]
 
-    def _turned_at(self, at: Kinematics) -> _Turned:
-        """`_turned` computed anew."""
+    def _seen_at(self, at: Kinematics) -> _SeenPairs:
+        """`_seen` computed anew."""
         f, slopes, least, _ = self.bearings(at.focal)
         C, (body, halfway, rates) = at.body_R_camera, self._gyroscope_turns(at.offset_s)
         if at.readout_s != 0.0:
@@ -203,7 +204,7 @@ class RotationProblem:
         if at.scale != 1.0:
             body = Rotation.from_rotvec(Rotation.from_matrix(body).as_rotvec() / at.scale)
             body = body.as_matrix()
-        return _Turned(f[0], f[1], slopes[0], slopes[1], C.T @ body @ C, least)
+        return _SeenPairs(f[0], f[1], slopes[0], slopes[1], C.T @ body @ C, least)
 
     def _gyroscope_turns(self, offset_s: float) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Rotations (P, 3, 3) from the second body of each pair to the first, by the gyroscope.
@@ -227,23 +228,23 @@ class RotationProblem:
 
     def directions(self, at: Kinematics, noise: float) -> FloatArray:
         """Directions (P, 3) of the translations that fit best, robustly."""
-        turned, known = self._turned(at), self.bearings(at.focal)[3]
+        seen, known = self._seen(at), self.bearings(at.focal)[3]
         weights = known.astype(np.float64)
-        t = turned.direction(weights, np.zeros(known.shape), alike=True)
+        t = seen.direction(weights, np.zeros(known.shape), normalize=True)
         for _ in range(_DIRECTIONS):
-            e, sigma, _ = turned.distances(t)
+            e, sigma, _ = seen.distances(t)
             scale = np.maximum(_scales(np.abs(e), known), noise)[:, None]
             weights = known / (1.0 + (e / (_CAUCHY * scale)) ** 2) / sigma**2
-            t = turned.direction(weights, weights * e**2)
+            t = seen.direction(weights, weights * e**2)
         return t
 
     def distances(self, at: Kinematics, t: FloatArray) -> FloatArray:
         """Epipolar distances (P, N), pixels."""
-        return self._turned(at).distances(t)[0]
+        return self._seen(at).distances(t)[0]
 
     def residuals(self, at: Kinematics, t: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Epipolar distances (P, N), pixels, and their derivatives (P, 2, N) by the directions."""
-        e, _, slopes = self._turned(at).distances(t, with_slopes=True)
+        e, _, slopes = self._seen(at).distances(t, with_slopes=True)
         return e, (slopes @ _tangents(t)).transpose(0, 2, 1)
 
     def noise_px(self, at: Kinematics) -> float:

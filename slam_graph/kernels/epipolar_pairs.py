@@ -25,8 +25,8 @@ __all__ = [
     "epipolar_moments_numpy",
 ]
 
-SHORTEST = 1e-6
-"""Squared length of a normal; shorter ones count as if they were so long."""
+_LEAST_SQUARE = 1e-6
+"""Least squared length of a normal that weights are divided by."""
 
 
 @compiled()
@@ -79,28 +79,29 @@ def epipolar_distances(
         least: (P, N) smallest variance of t · n for pixels with unit noise.
         distances: (P, N), filled.
         sigmas: (P, N), filled: the deviations of t · n.
-        slopes: (P, N, 3), filled: derivatives of the distances by t; (0, 0, 0) to leave them out.
+        slopes: (P, N, 3), filled: derivatives of the distances by t, where `least` is reached as if
+            it were not; (0, 0, 0) to leave them out.
     """
-    normals = np.empty((5, 3))
+    normals, along = np.empty((5, 3)), np.empty(5)
     for p in range(len(t)):
         x, y, z = t[p, 0], t[p, 1], t[p, 2]
         for n in range(one.shape[1]):
             _fill_normals(one[p, n], two[p, n], by_one[p, n], by_two[p, n], R[p], normals)
             variance = 0.0
+            for k in range(5):
+                along[k] = x * normals[k, 0] + y * normals[k, 1] + z * normals[k, 2]
             for k in range(1, 5):
-                along = x * normals[k, 0] + y * normals[k, 1] + z * normals[k, 2]
-                variance += along * along
+                variance += along[k] * along[k]
             variance = max(variance, least[p, n])
             sigma = math.sqrt(variance)
-            distance = (x * normals[0, 0] + y * normals[0, 1] + z * normals[0, 2]) / sigma
+            distance = along[0] / sigma
             distances[p, n], sigmas[p, n] = distance, sigma
             if len(slopes) == 0:
                 continue
             for c in range(3):
                 half = 0.0  # of the derivative of the variance
                 for k in range(1, 5):
-                    along = x * normals[k, 0] + y * normals[k, 1] + z * normals[k, 2]
-                    half += along * normals[k, c]
+                    half += along[k] * normals[k, c]
                 slopes[p, n, c] = normals[0, c] / sigma - half * distance / variance
 
 
@@ -116,7 +117,7 @@ def epipolar_moments(
     R: FloatArray,
     weights: FloatArray,
     by_noise: FloatArray,
-    alike: bool,
+    normalize: bool,
     moments: FloatArray,
 ) -> None:
     """Fill second moments of the normals, less what the noise of the pixels adds to them.
@@ -129,8 +130,9 @@ def epipolar_moments(
         R: (P, 3, 3) first_R_second of the camera.
         weights: (P, N) of the normals.
         by_noise: (P, N) squared noise of the pixels times weights.
-        alike: whether weights are of normals with one length.
-        moments: (P, 3, 3), filled: sums of w n nᵀ - w σ² cov(n).
+        normalize: whether weights are divided by |n|²; `by_noise` is not.
+        moments: (P, 3, 3), filled: sums of w n nᵀ less those of `by_noise` cov(n), for pixels with
+            unit noise.
     """
     normals = np.empty((5, 3))
     for p in range(len(R)):
@@ -142,9 +144,9 @@ def epipolar_moments(
             if weight == 0.0 and noise == 0.0:
                 continue
             _fill_normals(one[p, n], two[p, n], by_one[p, n], by_two[p, n], R[p], normals)
-            if alike:
+            if normalize:
                 square = normals[0, 0] * normals[0, 0] + normals[0, 1] * normals[0, 1]
-                weight /= max(square + normals[0, 2] * normals[0, 2], SHORTEST)
+                weight /= max(square + normals[0, 2] * normals[0, 2], _LEAST_SQUARE)
             for a in range(3):
                 for b in range(a, 3):
                     spread = 0.0
@@ -187,13 +189,13 @@ def epipolar_moments_numpy(
     R: FloatArray,
     weights: FloatArray,
     by_noise: FloatArray,
-    alike: bool,
+    normalize: bool,
     moments: FloatArray,
 ) -> None:
     """`epipolar_moments` in NumPy."""
     normals, spread = _normals(one, two, by_one, by_two, R)
-    if alike:
-        weights = weights / np.maximum(np.sum(normals**2, axis=2), SHORTEST)
+    if normalize:
+        weights = weights / np.maximum(np.sum(normals**2, axis=2), _LEAST_SQUARE)
     moments[:] = np.einsum("pn,pna,pnb->pab", weights, normals, normals)
     moments -= np.einsum("pn,pnka,pnkb->pab", by_noise, spread, spread)
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -83,7 +83,7 @@ class RunResult(RunSummary):
 
     input: RunInput
     ending: Ending = field(default_factory=Ending)
-    history: StateHistory = field(default_factory=StateHistory)
+    history: StateHistory = field(default_factory=partial(StateHistory, compact=True))
     segments: Segments = field(default_factory=Segments)
     start_was_given: bool = False
     georeferenced: bool = False

@@ -146,7 +146,7 @@ class _Problem:
     def body_turns(self, offsets: FloatArray) -> FloatArray:
         """Rotation vectors (D, K, 3) of the body between the frames, for D offsets."""
         one, two = (self._gyro.orientation(t + offsets[:, None]) for t in self._t)
-        return _logarithms(one.swapaxes(-1, -2) @ two)
+        return _rotation_vectors(one.swapaxes(-1, -2) @ two)
 
     def rotation_by_wahba(self, body: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Mounting (D, 3, 3) and squared residual (D,) for rotation vectors (D, K, 3) of the body.
@@ -177,7 +177,7 @@ class _Problem:
         half = Rotation.from_rotvec(-0.5 * body.reshape(-1, 3)).as_matrix()
         half = half.reshape(*body.shape, 3)
         seen = C @ self._turns.R @ C.T
-        r = -_logarithms(half @ (half @ seen))
+        r = -_rotation_vectors(half @ (half @ seen))
         J = -half * self._seconds[:, None, None]
         if free:  # C exp(θ) turns the vectors by θ × v
             vectors = Rotation.from_matrix(self._turns.R).as_rotvec()
@@ -187,8 +187,8 @@ class _Problem:
         return (root @ r[..., None])[..., 0], root @ J
 
 
-def _logarithms(R: FloatArray) -> FloatArray:
-    """Rotation vectors (..., 3) of matrices (..., 3, 3), by far less than half a turn.
+def _rotation_vectors(R: FloatArray) -> FloatArray:
+    """Rotation vectors (..., 3) of rotations (..., 3, 3) by less than half a turn.
 
     `Rotation.from_matrix` takes ten times as long, and looks whether they are rotations.
     """

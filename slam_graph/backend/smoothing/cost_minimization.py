@@ -69,7 +69,7 @@ def minimized(
             try:
                 if factor is None:
                     known = None  # it is large
-                    factor, damped = linear.factor(damping, exact=False), damping
+                    factor, damped = linear.factor(damping), damping
                 else:
                     factor = factor.renewed(linear, damped)
                 step = factor.step(linear)

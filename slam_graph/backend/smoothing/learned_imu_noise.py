@@ -85,9 +85,9 @@ class _LinearImages:
         """Go back to the minimum."""
         self.gradient, self._moved = self._at_minimum.copy(), np.zeros(self._moved.shape)
 
-    def factor(self, chain: ChainEquations, exact: bool = True) -> EliminatedStates:
+    def factor(self, chain: ChainEquations) -> EliminatedStates:
         """The factor of the states with all other factors."""
-        return EliminatedStates(self.features.poses.copy(), chain, exact=exact)
+        return EliminatedStates(self.features.poses.copy(), chain)
 
     def step(self, states: EliminatedStates, chain: ChainEquations) -> FloatArray:
         """Moves by a Gauss-Newton step.
@@ -199,27 +199,26 @@ def _learned(
 
     Returns:
         None if steps under another noise cannot be taken, or raise the cost. The factor of the
-        states is that of the last round; None where fewer were enough.
+        states is None where the noise is as assumed.
     """
     cost, values, inertial = found.cost, found.estimates.states, found.cost.inertial
-    states, rounds = near, 0
+    states: EliminatedStates | None = None
     try:
-        if states is None:
-            chain = _chain(_with_gauge(inertial, factors, values), values)
-            states = images.factor(chain, exact=False)
-        while rounds < _ROUNDS and factors.learn_noise(inertial, values, states.times_covariance):
-            rounds += 1
+        known = near or images.factor(_chain(_with_gauge(inertial, factors, values), values))
+        for _ in range(_ROUNDS):
+            if not factors.learn_noise(inertial, values, known.times_covariance):
+                break
             inertial = factors.inertial(values)
             chain = _chain(_with_gauge(inertial, factors, values), values)
-            states = images.factor(chain, exact=rounds == _ROUNDS)
-            values = moved_states(values, images.step(states, chain))
+            known = states = images.factor(chain)
+            values = moved_states(values, images.step(known, chain))
             count_step()
-        if rounds == 0:
+        if states is None:
             return inertial, None, found.estimates
         moved = images.moved(found.estimates, values)
         under = cost.with_inertial(_with_gauge(inertial, factors, found.estimates.states))
         if under.value(moved) <= under.value(found.estimates):
-            return inertial, states if rounds == _ROUNDS else None, moved
+            return inertial, states, moved
         logger.info("the noise of the IMU is not learned: steps under it raise the cost")
     except (RuntimeError, np.linalg.LinAlgError) as error:
         logger.info("the noise of the IMU is not learned: %s", error)

@@ -171,7 +171,8 @@ class EliminatedFeatures:
 
     Attributes:
         fixes: the factor of these variables, whose remains are in `poses` too.
-        poses: (n, n) lower triangle of the information on the poses, in `StateColumns`.
+        poses: (n, n) lower triangle of the information on the poses, in `StateColumns`; until
+            `EliminatedStates` overwrites it.
     """
 
     def __init__(
@@ -284,15 +285,14 @@ class LinearCost:
         keyframes = len(self.chain.gradient)
         return EliminatedFeatures(self.images, keyframes, damping, self.fixes, reduce)
 
-    def factor(self, damping: float, exact: bool = True) -> Factor:
-        """The factor of the normal equations, damped; see `EliminatedStates` for `exact`.
+    def factor(self, damping: float) -> Factor:
+        """The factor of the normal equations, damped.
 
         Raises:
             LinAlgError: if they are not positive definite.
         """
         features = self.eliminated(damping)
-        poses, features.poses = features.poses, np.zeros((0, 0))  # it is large
-        return Factor(features, EliminatedStates(poses, self.chain, damping, exact))
+        return Factor(features, EliminatedStates(features.poses, self.chain, damping))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -16,7 +16,7 @@ Keyframe k has the pose X(k), the velocity V(k) and the bias B(k).
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import pairwise
 
 import gtsam
@@ -129,9 +129,6 @@ GYRO_BIAS_SIGMA = 0.05
 """Prior on the first gyroscope bias, rad/s: loose, as the estimate of a filter after its start."""
 ACCEL_BIAS_SIGMA = 0.3
 """Prior on the first accelerometer bias, m/s²: loose, as above."""
-_SAME_BIAS = np.repeat([0.1, 3e-3], 3)
-"""Biases, m/s² and rad/s, that differ by less are of the same preintegration: factors correct it to
-first order."""
 
 
 class RecordingFactors:
@@ -172,10 +169,9 @@ class RecordingFactors:
         self._learned = [np.sqrt(np.mean(noise**2, axis=0)).tolist() for noise in frames]
         longest_s = backend.noise.max_imu_gap_s
         self._gaps = [segment.imu.largest_gap_s(*interval) > longest_s for interval in between]
-        self._made: _Preintegrated | None = None
 
     def inertial(self, values: gtsam.Values) -> gtsam.NonlinearFactorGraph:
-        """Priors, IMU and zero-velocity factors, preintegrated near the biases of `values`."""
+        """Priors, IMU and zero-velocity factors, preintegrated at the biases of `values`."""
         aiding = self._segment.aiding
         other = [*aiding.fixes, *aiding.odometry]
         return _graph(self._prior(values) + self._dynamics(values) + other)
@@ -281,14 +277,6 @@ class RecordingFactors:
 
     def _dynamics(self, values: gtsam.Values) -> list[gtsam.NonlinearFactor]:
         """IMU factors between consecutive keyframes, and zero-velocity factors."""
-        keyframes = range(len(self._segment.keyframes))
-        biases = np.array([values.atConstantBias(B(k)).vector() for k in keyframes])
-        if self._made is None or not self._made.holds(self.noise, biases):
-            self._made = _Preintegrated(self.noise, biases, self._preintegrated(values))
-        return self._made.factors
-
-    def _preintegrated(self, values: gtsam.Values) -> list[gtsam.NonlinearFactor]:
-        """`_dynamics` made anew."""
         factors: list[gtsam.NonlinearFactor] = []
         noise = self._backend.noise
         calibrated = self.noise.walks(self._rig.imu)
@@ -300,26 +288,6 @@ class RecordingFactors:
             if np.isfinite(self._segment.still_sigmas[i + 1 : j + 1]).all():
                 factors += zero_velocity_factors(k, k + 1, self._segment.still_sigmas[j])
         return factors
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Preintegrated:
-    """Factors of the dynamics.
-
-    Attributes:
-        noise: that they were made with.
-        biases: (K, 6) that they were preintegrated at.
-        factors: of all intervals.
-    """
-
-    noise: ImuNoiseFactors
-    biases: FloatArray
-    factors: list[gtsam.NonlinearFactor]
-
-    def holds(self, noise: ImuNoiseFactors, biases: FloatArray) -> bool:
-        """Whether they are those under a noise and near biases (K, 6)."""
-        near = np.all(np.abs(biases - self.biases) < _SAME_BIAS)
-        return noise == self.noise and bool(near)
 
 
 def _graph(factors: list[gtsam.NonlinearFactor]) -> gtsam.NonlinearFactorGraph:

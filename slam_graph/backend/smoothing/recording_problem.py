@@ -89,26 +89,18 @@ class BundleAdjustment:
         start: segment, initial states and anchor.
         task: calibration and settings.
         report: is given the progress after each step.
-        factors: of another problem with the same states, whose features differ.
 
     Attributes:
         iterations: steps so far.
-        factors: of the IMU and all else that is no image.
     """
 
-    def __init__(
-        self,
-        start: SegmentStart,
-        task: SmoothingTask,
-        report: Report,
-        factors: RecordingFactors | None = None,
-    ) -> None:
+    def __init__(self, start: SegmentStart, task: SmoothingTask, report: Report) -> None:
         self._segment = segment = start.segment
         self._task = replace(task, rig=with_gtsam_cameras(task.rig))
         self._backend, self._config = backend, config = task.backend, task.config
         self._projection = RigProjection(self._task.rig, taken_by=task.rig)
         self._report = report
-        self.factors = factors or RecordingFactors(
+        self._factors = RecordingFactors(
             segment, start.anchor, self._task.rig, backend, config, task.least_noise
         )
         seen = segment.seen_by_keyframes()
@@ -126,7 +118,7 @@ class BundleAdjustment:
     @property
     def imu_noise(self) -> ImuNoiseFactors:
         """Estimated factors on the noise of the IMU, beyond those that the causal run learned."""
-        return self.factors.noise
+        return self._factors.noise
 
     def solve(self) -> AdjustedSegment:
         """Go near the minimum, remove outliers, and minimise.
@@ -164,7 +156,7 @@ class BundleAdjustment:
             pixel_sigma=self._sigma_px,
             inefficiency=self._inefficiency,
         )
-        aligned, equations, assumed = None, None, self.factors.noise
+        aligned, equations, assumed = None, None, self._factors.noise
         try:
             equations = self._equations()
             covariances, self._values = equations.covariances(), equations.minimum.values
@@ -173,7 +165,7 @@ class BundleAdjustment:
         except (RuntimeError, np.linalg.LinAlgError) as error:
             logger.info("no covariances: %s", " ".join(str(error).split())[:200])
             states, equations = self._states(self._segment.stamps_ns), None
-            self.factors.noise = assumed
+            self._factors.noise = assumed
         figures = replace(figures, iterations=self.iterations)
         kept = equations if self._task.joint else None
         fixes = None if equations is None else equations.minimum.fixes
@@ -297,7 +289,7 @@ class BundleAdjustment:
         Returns:
             The minimum, and the part of IMU and priors in it.
         """
-        inertial = self.factors.inertial(self._values)
+        inertial = self._factors.inertial(self._values)
         cost = RecordingCost(
             inertial,
             ReprojectionCost(
@@ -353,12 +345,12 @@ class BundleAdjustment:
         minimum = equations_at_minimum(
             self._minimum,
             near,
-            self.factors,
+            self._factors,
             self._config.learn_imu_noise,
             self._task.joint,
             self._count_step,
         )
-        densities, level = self.factors.densities(), self._task.rig.has_imu
+        densities, level = self._factors.densities(), self._task.rig.has_imu
         stamps_ns, keyframes = self._segment.stamps_ns, self._segment.keyframes
         features = self._minimum.cost.images.obs.ids
         return PoseEquations.of(minimum, stamps_ns, keyframes, densities, level, features)

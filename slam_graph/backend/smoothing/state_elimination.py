@@ -6,8 +6,7 @@ Features connect the poses of keyframes, nearly all with all others where places
 the information of the poses is a dense matrix. IMU factors connect a state with the next one only.
 Velocities and biases are eliminated first, in blocks of consecutive keyframes: each block leaves
 its poses, and velocity and bias of the two states at its ends, which are joints with the blocks
-beside it. What is left is dense and is factorised by LAPACK, as UᵀU, in single precision where that
-is enough: steps towards a minimum, and noise that is estimated by random signs.
+beside it. What is left is dense and is factorised by LAPACK, as UᵀU.
 
 A state has 15 components: pose (rotation, translation), velocity, bias (accelerometer, gyroscope).
 
@@ -24,11 +23,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import lapack, solve_triangular
 
 from slam_graph.arrays import FloatArray, IntArray
@@ -39,11 +36,6 @@ _POSE, _MOTION = 6, 9
 """Components of a pose; of velocity and bias."""
 _BLOCK = 20
 """Intervals between keyframes in a block: the dense system has 9 / 20 columns more per keyframe."""
-_LARGE = 1000
-"""Columns from which on single precision is worth its while: it takes a third of the time."""
-_LARGEST_CONDITION = 5e7
-"""Condition number with unit diagonal up to which single precision is used. A solution is wrong by
-0.02 of its length at most then: at 8e6 that was 0.004."""
 _PARTS = {"x": np.arange(6), "v": np.arange(6, 9), "b": np.arange(9, 15)}
 """Components of each kind of variable in a state."""
 
@@ -140,19 +132,12 @@ class EliminatedStates:
             behind them, zero so far. It is overwritten, as it is large.
         chain: the other factors.
         damping: is added to the diagonal.
-        exact: whether single precision is not enough.
 
     Raises:
         LinAlgError: if the equations are not positive definite.
     """
 
-    def __init__(
-        self,
-        poses: FloatArray,
-        chain: ChainEquations,
-        damping: float = 0.0,
-        exact: bool = True,
-    ) -> None:
+    def __init__(self, poses: FloatArray, chain: ChainEquations, damping: float = 0.0) -> None:
         self._columns = columns = StateColumns.of(len(chain.gradient))
         self._blocks = []
         S = poses
@@ -166,11 +151,6 @@ class EliminatedStates:
             own = columns.kept(block)
             S[np.ix_(own, own)] += M[np.ix_(kept, kept)] - Y.T @ Y
             self._blocks.append(_Block(C, Y))
-        single = None if exact or len(S) < _LARGE else _in_single_precision(S)
-        if single is not None:
-            self._U, self._scale = single
-            return
-        self._scale = np.ones(1)
         self._U, info = lapack.dpotrf(S.T, lower=0, clean=1, overwrite_a=1)
         if info != 0:
             raise np.linalg.LinAlgError("the cost does not determine all of its variables")
@@ -188,9 +168,8 @@ class EliminatedStates:
             own = right[first + 1 : last, _POSE:].reshape(-1, width)
             inside.append(solve_triangular(block.C, own, lower=True, check_finite=False))
             reduced[columns.kept(number)] -= block.Y.T @ inside[-1]
-        reduced = (self._scale[:, None] * reduced).astype(self._U.dtype)
         half = solve_triangular(self._U, reduced, trans="T", check_finite=False)
-        x = self._scale[:, None] * solve_triangular(self._U, half, check_finite=False)
+        x = solve_triangular(self._U, half, check_finite=False)
         found = np.empty(right.shape)
         found[:, :_POSE] = x[:poses].reshape(-1, _POSE, width)
         found[columns.joints, _POSE:] = x[poses:].reshape(-1, _MOTION, width)
@@ -202,9 +181,8 @@ class EliminatedStates:
         return found
 
     def pair_covariances(self) -> FloatArray:
-        """Joint covariances (K-1, 30, 30) of neighbouring states, by a factor that is exact."""
+        """Joint covariances (K-1, 30, 30) of neighbouring states."""
         columns = self._columns
-        assert self._U.dtype == np.float64
         inverse, _ = lapack.dtrtri(self._U)
         pairs = np.empty((columns.keyframes - 1, 2 * STATE, 2 * STATE))
         for number, block in enumerate(self._blocks):
@@ -224,28 +202,6 @@ class EliminatedStates:
                 pair = rows[STATE * k : STATE * (k + 2)]
                 pairs[first + k] = pair @ pair.T
         return pairs
-
-
-def _in_single_precision(S: FloatArray) -> tuple[NDArray[Any], FloatArray] | None:
-    """A factor of S (n, n), of which the lower triangle is given, in single precision.
-
-    Returns:
-        U (n, n) with UᵀU = D S D, and the diagonal (n,) of D, which makes that of D S D one; None
-        if solutions by it would be too far off.
-    """
-    diagonal = np.diag(S)
-    if not np.all(diagonal > 0.0):
-        return None
-    scale = 1.0 / np.sqrt(diagonal)
-    unit = np.empty(S.shape, np.float32)
-    np.multiply(S, scale, out=unit, casting="same_kind")
-    unit *= scale[:, None].astype(np.float32)
-    sizes = np.abs(unit)
-    norm = float(np.max(sizes.sum(axis=0) + sizes.sum(axis=1))) - 1.0
-    U, info = lapack.spotrf(unit.T, lower=0, clean=0, overwrite_a=1)
-    if info != 0 or lapack.spocon(U, norm)[0] * _LARGEST_CONDITION < 1.0:
-        return None
-    return U, scale
 
 
 def _joined(information: FloatArray) -> FloatArray:

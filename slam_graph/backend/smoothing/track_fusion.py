@@ -33,7 +33,6 @@ from slam_graph.backend.smoothing.projected_matches import (
     match_probabilities,
     projected_matches,
 )
-from slam_graph.backend.smoothing.recording_factors import RecordingFactors
 from slam_graph.backend.smoothing.recording_problem import BundleAdjustment
 from slam_graph.backend.smoothing.recording_segment import (
     RecordingSegment,
@@ -82,17 +81,16 @@ def with_fused_features(
     chosen = np.unique([*range(anchor % _THINNING, len(states), _THINNING), 0, len(states) - 1])
     fixed = int(np.searchsorted(chosen, anchor))
     steps = rounds = 0
-    factors: RecordingFactors | None = None
 
     def adjusted(segment: RecordingSegment, states: list[NavState]) -> list[NavState]:
-        nonlocal steps, rounds, factors
+        nonlocal steps, rounds
         before = steps
         keyframes = segment.keyframes[chosen]
         aiding = segment.aiding.at(segment.stamps_ns[keyframes])
         thin = replace(segment, keyframes=keyframes, aiding=aiding)
         start = SegmentStart(thin, [states[k] for k in chosen], fixed)
-        problem = BundleAdjustment(start, task, lambda n, _: report(before + n, rounds), factors)
-        states, factors = problem.solve_loosely(segment.keyframe_stamps_ns), problem.factors
+        problem = BundleAdjustment(start, task, lambda n, _: report(before + n, rounds))
+        states = problem.solve_loosely(segment.keyframe_stamps_ns)
         steps, rounds = steps + problem.iterations, rounds + 1
         return states
 
