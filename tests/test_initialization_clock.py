@@ -23,6 +23,7 @@ from slam_graph.backend.initialization.clock_monitor import ClockMonitor
 from slam_graph.backend.initialization.gyro_alignment import (
     GyroAlignment,
     Turns,
+    _rotation_vectors,
     align_gyroscope,
 )
 from slam_graph.backend.initialization.start_calibration import FoundCalibration, StartCalibration
@@ -48,6 +49,14 @@ def camera_rotation(start_s: float, end_s: float) -> FloatArray:
     C = rig().cameras[0].body_T_camera.rotation().matrix()
     one, two = Flight().rotation(np.array([start_s, end_s])).as_matrix()
     return np.asarray(C.T @ one.T @ two @ C)
+
+
+@pytest.mark.parametrize("size", [0.0, 1e-12, 1e-9, 1e-6, 1e-3, 0.5, 2.0, 3.1])
+def test_rotation_vectors_are_those_of_scipy(size: float) -> None:
+    axes = np.random.default_rng(2).normal(size=(2, 4, 3))
+    vectors = size * axes / np.linalg.norm(axes, axis=-1, keepdims=True)
+    R = Rotation.from_rotvec(vectors.reshape(-1, 3)).as_matrix().reshape(2, 4, 3, 3)
+    np.testing.assert_allclose(_rotation_vectors(R), vectors, rtol=0.0, atol=1e-13)
 
 
 def test_visual_rotation_is_exact_without_noise() -> None:

@@ -387,10 +387,10 @@ def test_epipolar_distances_and_moments(features: int) -> None:
     assert all(same(a, b) for a, b in zip(*distances[:2], strict=True))
     assert all(np.array_equal(a, b) for a, b in zip(distances[0][:2], distances[2], strict=False))
     weights, by_noise = rng.uniform(size=(2, pairs, features)) * (rng.uniform(size=features) > 0.2)
-    for alike in False, True:
+    for normalize in False, True:
         moments = np.empty((2, pairs, 3, 3))
-        epipolar_moments(*seen, weights, by_noise, alike, moments[0])
-        epipolar_moments_numpy(*seen, weights, by_noise, alike, moments[1])
+        epipolar_moments(*seen, weights, by_noise, normalize, moments[0])
+        epipolar_moments_numpy(*seen, weights, by_noise, normalize, moments[1])
         assert same(*moments)
 
 

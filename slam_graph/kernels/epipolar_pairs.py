@@ -79,8 +79,8 @@ def epipolar_distances(
         least: (P, N) smallest variance of t · n for pixels with unit noise.
         distances: (P, N), filled.
         sigmas: (P, N), filled: the deviations of t · n.
-        slopes: (P, N, 3), filled: derivatives of the distances by t, where `least` is reached as if
-            it were not; (0, 0, 0) to leave them out.
+        slopes: (P, N, 3), filled: derivatives of the distances by t, for a variance that depends on
+            t also where it is `least`; (0, 0, 0) to leave them out.
     """
     normals, along = np.empty((5, 3)), np.empty(5)
     for p in range(len(t)):

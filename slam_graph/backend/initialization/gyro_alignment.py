@@ -188,9 +188,9 @@ class _Problem:
 
 
 def _rotation_vectors(R: FloatArray) -> FloatArray:
-    """Rotation vectors (..., 3) of rotations (..., 3, 3) by less than half a turn.
+    """Rotation vectors (..., 3), rad, of rotations (..., 3, 3) by less than half a turn.
 
-    `Rotation.from_matrix` takes ten times as long, and looks whether they are rotations.
+    By way of SciPy's quaternions it takes ten times as long.
     """
     x, y, z = R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1]
     sine = 0.5 * np.sqrt(x * x + y * y + z * z)
