@@ -22,7 +22,6 @@ from benchmarks.running import Errors
 from benchmarks.suite import Benchmark, Outcome
 from slam_graph import run
 from slam_graph.evaluation.consistency import average_nees, mean_bounds
-from slam_graph.geometry.trajectory_alignment import AlignmentMode
 from slam_graph.results import RunResult
 from slam_graph.simulation import simulate
 
@@ -81,8 +80,8 @@ def _figures(settings: dict[str, Any], seeds: range) -> list[Metric]:
         if nees is None or result.status != "ok":
             continue
         series.append(nees[1])
-        alignment: AlignmentMode = "se3" if result.history.has_scale else "sim3"
-        errors.append(Errors.of(flight.groundtruth(), result.trajectory, alignment).position_m)
+        accuracy = result.metrics["accuracy"][result.history.free]
+        errors.append(accuracy["ate"]["translation_m"]["rmse"])
     figures = [
         Metric("finished", len(series), "runs", "higher", len(seeds), EXACT),
         info("position", float(np.mean(errors)), "m"),

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from slam_graph.arrays import FloatArray
 from slam_graph.evaluation.consistency import mean_bounds
-from slam_graph.evaluation.evaluation_report import nees_of_run
+from slam_graph.evaluation.evaluation_report import accuracy_report, nees_of_run
 from slam_graph.geometry.state_history import StateHistory
 from slam_graph.geometry.trajectory import NavState, Trajectory
 
@@ -23,6 +23,8 @@ UNIT_M = 1.3
 """Metres of one unit of the estimate."""
 SCALE_STEP, PLACE_STEP_M, FIRST_M = 0.004, 0.0004, 1e-6
 FALSE_ALARMS = 1e-4
+MOUNTED = gtsam.Pose3(gtsam.Rot3.Ypr(0.7, -0.4, 1.9), np.array([0.3, -0.2, 0.1]))
+"""body_T_camera: the path of the camera is scaled, and its place in the body is not."""
 
 
 def path() -> Trajectory:
@@ -42,19 +44,21 @@ def state_at(truth: Trajectory, k: int, pose: gtsam.Pose3, P: FloatArray | None)
 
 def estimate(truth: Trajectory, rng: np.random.Generator) -> StateHistory:
     """States with errors of known covariance, in a unit of their own and another world."""
+    truth = truth.mounted(MOUNTED)
     arms = truth.positions - truth.positions[0]
     logs = np.concatenate([[0.0], np.cumsum(SCALE_STEP * rng.normal(size=STATES - 1))])
     places = np.cumsum(PLACE_STEP_M * rng.normal(size=(STATES, 3)), axis=0)
     turned = Rotation.from_euler("xyz", [0.4, -0.2, 2.0])
-    history = StateHistory(level=False, has_scale=False)
+    history = StateHistory(level=False, scaled_camera=MOUNTED)
     for k in range(STATES):
         p = turned.apply((1.0 + logs[k]) * arms[k] + places[k] - places[0]) / UNIT_M
         R = turned * Rotation.from_quat(truth.quaternions[k])
         along = R.as_matrix().T @ turned.apply(arms[k]) / UNIT_M
-        P = np.eye(15)
+        P = np.eye(15)  # of the camera first
         P[3:6, 3:6] = k * SCALE_STEP**2 * np.outer(along, along)
         P[3:6, 3:6] += (k * (PLACE_STEP_M / UNIT_M) ** 2 + FIRST_M**2) * np.eye(3)
-        pose = gtsam.Pose3(gtsam.Rot3(R.as_matrix()), p)
+        pose = gtsam.Pose3(gtsam.Rot3(R.as_matrix()), p).compose(MOUNTED.inverse())
+        P[:6, :6] = MOUNTED.AdjointMap() @ P[:6, :6] @ MOUNTED.AdjointMap().T
         history.append(state_at(truth, k, pose, P))
     return history
 
@@ -93,8 +97,23 @@ def test_the_scale_is_that_of_the_start_and_not_of_the_whole_path(
 
 def test_without_covariances_there_is_no_nees_and_no_failure() -> None:
     truth = path()
-    history = StateHistory(level=False, has_scale=False)
+    history = StateHistory(level=False, scaled_camera=MOUNTED)
     for k in range(STATES):
         pose = gtsam.Pose3(gtsam.Rot3(), truth.positions[k])
         history.append(state_at(truth, k, pose, None))
     assert len(nees_of_run(truth, history, False)[0].pose) == 0
+
+
+def test_a_scaled_path_of_the_camera_has_no_error() -> None:
+    """Although the path of the body, whose place beside the camera is in metres, is not scaled."""
+    truth = path()
+    cameras = truth.mounted(MOUNTED)
+    scaled = Trajectory(cameras.stamps_ns, cameras.positions / UNIT_M, cameras.quaternions)
+    estimate = scaled.mounted(MOUNTED.inverse())
+    of_camera, of_body = (
+        accuracy_report(truth, estimate, camera)["sim3"] for camera in (MOUNTED, gtsam.Pose3())
+    )
+    assert of_camera["scale"] == pytest.approx(UNIT_M)
+    assert of_camera["ate"]["translation_m"]["max"] < 1e-9
+    assert of_camera["ate"]["rotation_deg"]["max"] < 1e-6
+    assert of_body["ate"]["translation_m"]["max"] > 0.01

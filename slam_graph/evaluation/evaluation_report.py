@@ -10,6 +10,7 @@ from dataclasses import asdict, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, Literal
 
+import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
@@ -19,7 +20,7 @@ from slam_graph.evaluation.alignment_covariance import aligned_by_smoothed
 from slam_graph.evaluation.consistency import CONFIDENCE, Nees, mean_bounds, nees, ratio_bounds
 from slam_graph.evaluation.relative_pose_error import rpe
 from slam_graph.evaluation.truth_pairing import synchronize
-from slam_graph.evaluation.unknown_scale import scale_of_covariances
+from slam_graph.evaluation.unknown_scale import mounted_covariances, scale_of_covariances
 from slam_graph.geometry import (
     AlignmentMode,
     Similarity,
@@ -40,23 +41,27 @@ _NO_SCALE = "the scale is unknown: see sim3"
 Table = dict[str, Any]
 
 
-def accuracy_report(reference: Trajectory, estimate: Trajectory, has_scale: bool = True) -> Table:
+def accuracy_report(
+    reference: Trajectory, estimate: Trajectory, scaled_camera: gtsam.Pose3 | None = None
+) -> Table:
     """Absolute and relative errors, translation (m) and rotation (deg), under each alignment.
 
     Args:
         reference: the true trajectory.
         estimate: the other one.
-        has_scale: whether lengths of the estimate are metres; if not, there are errors after an
-            alignment in scale only.
+        scaled_camera: body_T_camera, where lengths of the estimate are known up to a scale. Errors
+            are then those of the camera's path, and only after an alignment in scale.
 
     Returns:
         For each alignment `{"scale", "poses", "ate": {"translation_m", "rotation_deg"}, "rpe":
         …}` with the statistics of each; a table of the form `{"unavailable": reason}` stands
         where the trajectories do not allow it.
     """
+    if scaled_camera is not None:
+        reference, estimate = (path.mounted(scaled_camera) for path in (reference, estimate))
     return {
         mode: _or_reason(partial(_errors_under, reference, estimate, mode))
-        if has_scale or mode == "sim3"
+        if scaled_camera is None or mode == "sim3"
         else {"unavailable": _NO_SCALE}
         for mode in _REPORTED_ALIGNMENTS
     }
@@ -149,7 +154,7 @@ def nees_of_run(
       whose orientation is wrong there turns all positions;
     - `first_pose_and_scale`, where nothing measures lengths: the scale, too, is that to which
       covariances are relative (`unknown_scale.py`). So a wrong scale as a whole is no error, and
-      one that drifts is.
+      one that drifts is. The poses are those of the camera, whose path it is that is scaled.
 
     Args:
         truth: the true trajectory.
@@ -161,6 +166,9 @@ def nees_of_run(
         DataError: if truth and estimate share no time.
     """
     estimate, covariances = history.trajectory(), history.pose_covariances()
+    if history.scaled_camera is not None:
+        covariances = mounted_covariances(covariances, history.scaled_camera)
+        truth, estimate = (path.mounted(history.scaled_camera) for path in (truth, estimate))
     if aligned:
         return nees(estimate, covariances, truth), "none"
     true, own = synchronize(truth, estimate)

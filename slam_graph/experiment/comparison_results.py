@@ -178,6 +178,9 @@ def _error_series(truth: Trajectory, result: RunResult) -> Series:
         true, estimate = synchronize(truth, result.trajectory)
     except DataError:
         return {}
+    camera = result.history.scaled_camera
+    if camera is not None:
+        true, estimate = (path.mounted(camera) for path in (true, estimate))
     steps = np.linalg.norm(np.diff(true.positions, axis=0), axis=1)
     series: Series = {
         "time_s": (estimate.stamps_ns - result.input.start_ns) * 1e-9,

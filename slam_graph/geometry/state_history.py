@@ -14,6 +14,8 @@ from slam_graph.arrays import FloatArray, GrowingTable
 from slam_graph.geometry.trajectory import NavState, Trajectory
 
 if TYPE_CHECKING:
+    import gtsam
+
     from slam_graph.geometry.trajectory_alignment import AlignmentMode
 
 _STATE_WIDTH = 16
@@ -33,16 +35,22 @@ class StateHistory:
 
     Args:
         level: see below.
-        has_scale: see below.
+        scaled_camera: see below.
         compact: whether entries of covariances are kept with seven digits, as a run may be long.
 
     Attributes:
         level: whether gravity was measured, so that the vertical of its world is known.
-        has_scale: whether anything measured lengths; if not, they are known up to a common scale.
+        scaled_camera: body_T_camera of the camera whose path is known up to a scale, where nothing
+            measured lengths; None where they are metres.
     """
 
-    def __init__(self, level: bool = True, has_scale: bool = True, compact: bool = False) -> None:
-        self.level, self.has_scale, self._compact = level, has_scale, compact
+    def __init__(
+        self,
+        level: bool = True,
+        scaled_camera: gtsam.Pose3 | None = None,
+        compact: bool = False,
+    ) -> None:
+        self.level, self.scaled_camera, self._compact = level, scaled_camera, compact
         self._stamps_ns = array("q")
         self._states = GrowingTable(_STATE_WIDTH)
         digits = np.float32 if compact else np.float64
@@ -58,6 +66,11 @@ class StateHistory:
         return self._states, self._pose_covariances, self._other_variances
 
     @property
+    def has_scale(self) -> bool:
+        """Whether anything measured lengths; if not, they are known up to a common scale."""
+        return self.scaled_camera is None
+
+    @property
     def free(self) -> AlignmentMode:
         """The alignment with a truth that takes away what nothing measured, and no more."""
         if not self.has_scale:
@@ -66,7 +79,7 @@ class StateHistory:
 
     def like(self) -> StateHistory:
         """A history of the same kind of world without states."""
-        return StateHistory(self.level, self.has_scale, self._compact)
+        return StateHistory(self.level, self.scaled_camera, self._compact)
 
     def __repr__(self) -> str:
         return f"StateHistory({len(self)} states)"

@@ -165,6 +165,13 @@ class Trajectory(Displayed):
         stamps_ns, quaternions = self.stamps_ns[rows], self.quaternions[rows]
         return Trajectory(stamps_ns, self.positions[rows], quaternions, **optional)
 
+    def mounted(self, body_T_part: gtsam.Pose3) -> Trajectory:
+        """The poses of a part that is mounted on the body, such as a camera."""
+        mounting, turns = body_T_part.matrix(), Rotation.from_quat(self.quaternions)
+        positions = self.positions + turns.apply(mounting[:3, 3])
+        turned = turns * Rotation.from_matrix(mounting[:3, :3])
+        return Trajectory(self.stamps_ns, positions, turned.as_quat())
+
     def tum_lines(self) -> Iterator[str]:
         """The lines of a TUM file: t[s] x y z qx qy qz qw, with nine decimals."""
         rows = np.hstack([self.positions, self.quaternions])

@@ -94,7 +94,7 @@ def run(
     sequence = _opened(recording, settings)
     result = RunResult(_part_of(sequence, settings))
     rig = result.input.rig
-    result.history.level, result.history.has_scale = rig.has_imu, rig.has_scale
+    result.history.level, result.history.scaled_camera = rig.has_imu, rig.scaled_camera
     if not rig.has_scale:
         sequence.diagnostics.warn("scale_unknown", _NO_SCALE)
     places = _place_stages(sequence, result, known_map)

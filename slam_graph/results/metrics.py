@@ -24,6 +24,8 @@ from slam_graph.results.segments import Segments
 from slam_graph.version import __version__
 
 if TYPE_CHECKING:
+    import gtsam
+
     from slam_graph.backend import FinalBa
     from slam_graph.loop_closure import LoopClosures
     from slam_graph.results.run_logs import RunLogs
@@ -78,18 +80,20 @@ def peak_memory_mb() -> float | None:
 
 
 def accuracy_table(
-    truth: Trajectory | None, trajectory: Trajectory | None, has_scale: bool = True
+    truth: Trajectory | None,
+    trajectory: Trajectory | None,
+    scaled_camera: gtsam.Pose3 | None = None,
 ) -> Table | None:
     """Errors against ground truth, or None where there is nothing to compare.
 
     Args:
         truth: the true trajectory.
         trajectory: the estimate.
-        has_scale: whether anything measured lengths; see `evaluation.accuracy_report`.
+        scaled_camera: see `evaluation.accuracy_report`.
     """
     if truth is None or trajectory is None or len(trajectory) == 0:
         return None
-    return evaluation.accuracy_report(truth, trajectory, has_scale)
+    return evaluation.accuracy_report(truth, trajectory, scaled_camera)
 
 
 def consistency_table(
@@ -165,7 +169,10 @@ def coverage(start_ns: int, end_ns: int, segments: Segments) -> float:
 
 
 def segments_table(
-    segments: Segments, trajectory: Trajectory, truth: Trajectory | None, has_scale: bool = True
+    segments: Segments,
+    trajectory: Trajectory,
+    truth: Trajectory | None,
+    scaled_camera: gtsam.Pose3 | None = None,
 ) -> list[Table]:
     """What each segment reached, each aligned on its own; empty for a run in one piece."""
     if len(segments) < 2:
@@ -176,7 +183,7 @@ def segments_table(
             "end_ns": segment.end_ns,
             "joined_by": segment.joined_by,
             "ended_by": segment.ended_by,
-            "accuracy": accuracy_table(truth, segment.part_of(trajectory), has_scale),
+            "accuracy": accuracy_table(truth, segment.part_of(trajectory), scaled_camera),
         }
         for segment in segments
     ]
@@ -186,7 +193,7 @@ def final_ba_table(final_ba: FinalBa | None, truth: Trajectory | None) -> Table 
     """Size, cost, accuracy and consistency of the final bundle adjustment, if there was one."""
     if final_ba is None:
         return None
-    accuracy = accuracy_table(truth, final_ba.trajectory, final_ba.history.has_scale)
+    accuracy = accuracy_table(truth, final_ba.trajectory, final_ba.history.scaled_camera)
     nees = consistency_table(truth, final_ba.history, given=False, smoothed=final_ba)
     fixes = {} if final_ba.fixes is None else {"fixes": final_ba.fixes.table()}
     return {**asdict(final_ba.summary), "accuracy": accuracy, "nees": nees, **fixes}
@@ -196,7 +203,7 @@ def loop_closure_table(
     loops: LoopClosures | None,
     corrected: Trajectory | None,
     truth: Trajectory | None,
-    has_scale: bool = True,
+    scaled_camera: gtsam.Pose3 | None = None,
 ) -> Table | None:
     """What loop closure found and reached, if loops were to be closed.
 
@@ -204,7 +211,7 @@ def loop_closure_table(
         loops: what was found.
         corrected: the trajectory after loop closure.
         truth: the true trajectory.
-        has_scale: whether anything measured lengths.
+        scaled_camera: see `evaluation.accuracy_report`.
     """
     if loops is None or corrected is None:
         return None
@@ -212,7 +219,7 @@ def loop_closure_table(
         "keyframes": len(loops.keyframes),
         "verified": len(loops.loops),
         "accepted": int(loops.accepted.sum()),
-        "accuracy": accuracy_table(truth, corrected, has_scale),
+        "accuracy": accuracy_table(truth, corrected, scaled_camera),
     }
 
 

@@ -18,6 +18,8 @@ from slam_graph.errors import DataError
 from slam_graph.geometry import AlignmentMode, Similarity, StateHistory, Trajectory, interpolate
 
 if TYPE_CHECKING:
+    import gtsam
+
     from slam_graph.backend import FinalBa
     from slam_graph.visualization import Panel, Picture
 
@@ -69,6 +71,12 @@ class PoseEstimate:
         covariances = units[:, None] * self.covariances * units
         return PoseEstimate(similarity.apply(self.trajectory), covariances)
 
+    def at_camera(self, body_T_camera: gtsam.Pose3) -> PoseEstimate:
+        """The poses of a camera on the body."""
+        by_body = body_T_camera.inverse().AdjointMap()
+        covariances = by_body @ self.covariances @ by_body.T
+        return PoseEstimate(self.trajectory.mounted(body_T_camera), covariances)
+
     def world_sigmas(self) -> FloatArray:
         """(N, 4) standard deviations of x, y, z [m] and yaw [deg], in the axes of the world."""
         R = Rotation.from_quat(self.trajectory.quaternions).as_matrix()
@@ -104,6 +112,16 @@ class RunView:
             {name: similarity.apply(path) for name, path in self.paths.items()},
             self.truth,
             similarity.scale * self.points @ similarity.rotation.T + similarity.translation,
+            self.start_ns,
+        )
+
+    def at_camera(self, body_T_camera: gtsam.Pose3) -> RunView:
+        """The same of a camera on the body."""
+        return RunView(
+            {name: estimate.at_camera(body_T_camera) for name, estimate in self.estimates.items()},
+            {name: path.mounted(body_T_camera) for name, path in self.paths.items()},
+            None if self.truth is None else self.truth.mounted(body_T_camera),
+            self.points,
             self.start_ns,
         )
 
@@ -157,6 +175,9 @@ def with_covariances_after_alignment(
     """
     if view.truth is None or given:
         return view
+    camera = histories[CAUSAL].scaled_camera
+    if camera is not None:  # its path is scaled, and not that of the body
+        return view.at_camera(camera).aligned(histories[CAUSAL].free)
     estimates = {}
     similarity = None
     for name, history in histories.items():

@@ -273,12 +273,14 @@ class RunResult(RunSummary):
                 | ({} if self.fix_calibration is None else self.fix_calibration.table()),
                 "extent": extent | tables.world_table(self.history, self.start_was_given),
                 "segments": tables.segments_table(
-                    self.segments, self.trajectory, truth, self.history.has_scale
+                    self.segments, self.trajectory, truth, self.history.scaled_camera
                 ),
-                "accuracy": tables.accuracy_table(truth, self.trajectory, self.history.has_scale),
+                "accuracy": tables.accuracy_table(
+                    truth, self.trajectory, self.history.scaled_camera
+                ),
                 "final_ba": tables.final_ba_table(self.final_ba, truth),
                 "loop_closure": tables.loop_closure_table(
-                    self.loops, self.loop_closed, truth, self.history.has_scale
+                    self.loops, self.loop_closed, truth, self.history.scaled_camera
                 ),
                 "slam_map": None if self.slam_map is None else self.slam_map.summary(),
                 "localization": (

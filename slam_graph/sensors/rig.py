@@ -192,6 +192,14 @@ class Rig:
         return self.has_imu or len(self.cameras) > 1 or self.depth is not None
 
     @property
+    def scaled_camera(self) -> gtsam.Pose3 | None:
+        """body_T_camera of the only camera, where nothing measures lengths; else None.
+
+        Its path has a scale of its own then, while its place in the body is in metres.
+        """
+        return None if self.has_scale else self.cameras[0].body_T_camera
+
+    @property
     def pose_offset_s(self) -> float:
         """Time of the pose of a frame, on the clock of the IMU, since the frame's stamp.
 

@@ -174,7 +174,7 @@ class RerunViewer:
         if self._detail == "graph":
             show_window(self._stream, estimator)
         if self._truth is not None and number % _ALIGN_FRAMES == 0:
-            free = StateHistory(estimator.rig.has_imu, estimator.rig.has_scale).free
+            free = StateHistory(estimator.rig.has_imu, estimator.rig.scaled_camera).free
             alignment: AlignmentMode = "none" if estimator.start_is_given else free
             self._outcome.show_truth(self._truth, self._history.trajectory(), alignment)
 

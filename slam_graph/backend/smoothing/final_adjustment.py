@@ -198,7 +198,7 @@ def _smoothed(log: FrameLog, causal: Trajectory, task: SmoothingTask, report: Re
     if len(keyframes) > longest:
         task = replace(task, joint=False)
     level = task.rig.has_imu
-    history = StateHistory(level, task.rig.has_scale)
+    history = StateHistory(level, task.rig.scaled_camera)
     states: list[NavState] = []  # of the last segment, from its anchor on
     solved: list[AdjustedSegment] = []
     for first, stop in segments(len(keyframes), longest):
