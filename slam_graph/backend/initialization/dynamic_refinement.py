@@ -90,7 +90,8 @@ class DynamicRefinement:
 
     Attributes:
         outliers: ids (N,) of the features that did not fit the last solution, ascending.
-        scale_sigma: relative standard deviation of the scale of the last solution.
+        scale_sigma: relative standard deviation of the scale of the last solution; infinite if the
+            last attempt did not come so far.
     """
 
     def __init__(
@@ -98,6 +99,7 @@ class DynamicRefinement:
         context: EngineContext,
         max_scale_sigma: float,
         white_noise_factor: float = _WHITE_NOISE_FACTOR,
+        hopeless: float = _HOPELESS,
     ) -> None:
         """Prepare for attempts.
 
@@ -105,12 +107,15 @@ class DynamicRefinement:
             context: shared with the engine.
             max_scale_sigma: largest accepted standard deviation of the scale, relative to it.
             white_noise_factor: least factor on the calibrated white noise of the IMU.
+            hopeless: a guess whose scale is so many times less well known than accepted is not
+                refined.
         """
         self.outliers = np.zeros(0, np.int64)
         self.scale_sigma = float("inf")
         self._context = context
         self._max_scale_sigma = max_scale_sigma
         self._white_noise_factor = white_noise_factor
+        self._hopeless_factor = hopeless
 
     def refine(
         self, frames: StartFrames, guess: StartGuess, first: NavState | None = None
@@ -123,7 +128,7 @@ class DynamicRefinement:
             first: the first of these states with its covariance, if it is known. The window is in
                 its world then; else in one that the last frame defines.
         """
-        lasting = _lasting(frames)
+        lasting, self.scale_sigma = _lasting(frames), float("inf")
         try:
             cost = self._batch_cost(frames, guess, lasting, first)
             linear = cost.linearize(summed=True)
@@ -178,7 +183,7 @@ class DynamicRefinement:
         if linear.tracks is None:
             return Refusal("fit", f"features that fit the motion (0 of {static} do)")
         sigma = _scale_sigma(cost, linear, linearized(cost, linear))
-        if sigma > _HOPELESS * self._max_scale_sigma:
+        if sigma > self._hopeless_factor * self._max_scale_sigma:
             needs = f"more motion (scale is known to {sigma:.0%} only)"
             return Refusal("motion", needs)
         return None
