@@ -11,7 +11,7 @@ The world stays the same, and so do the states before if the solution does not c
 
 from __future__ import annotations
 
-import numpy as np
+import math
 
 from slam_graph.arrays import IntArray
 from slam_graph.backend.engine_protocol import EngineContext
@@ -104,9 +104,10 @@ class TakeOff:
     def _retry_s(self) -> float:
         """Time from an attempt until the scale can be known, in whole times of the shortest."""
         missing = self._refinement.scale_sigma / _MAX_SCALE_SIGMA
-        if not np.isfinite(missing):
+        if not math.isfinite(missing):
             return RETRY_S
-        wait_s = self.elapsed_ns * 1e-9 * (missing ** (1.0 / _FASTEST_GAIN) - 1.0)
+        grown = math.pow(missing, 1.0 / _FASTEST_GAIN)
+        wait_s = self.elapsed_ns * 1e-9 * (grown - 1.0)
         return RETRY_S * max(wait_s // RETRY_S, 1.0)
 
     def _solution(self, dynamic: IntArray) -> Window | None:
