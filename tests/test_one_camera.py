@@ -17,8 +17,8 @@ from gtsam.symbol_shorthand import B, L, V, X
 from slam_graph import run
 from slam_graph.arrays import FloatArray
 from slam_graph.backend.backend_config import BackendConfig
+from slam_graph.backend.cost.unit_of_length import scale_direction
 from slam_graph.backend.estimator import Estimator
-from slam_graph.backend.initialization.monocular_start import scale_direction
 from slam_graph.backend.initialization.start_diagnosis import Refusal
 from slam_graph.backend.initialization.two_views import TwoViews, two_view_motion
 from slam_graph.backend.policies import AlgorithmConfig

@@ -8,8 +8,8 @@ later it drifts. A scale that is fitted over the whole path takes the mean of th
 the covariances do not; and at the start, where the fit is off, it makes errors that are many σ.
 
 It is the path of the camera that has this scale, not that of the body: the place of the camera in
-the body is in metres. So all is asked of the camera: in a unit that is a quarter too
-long, the path of the body of EuRoC's rig would be up to 3 cm off where the camera's is right.
+the body is in metres. So errors are taken at the camera: with a unit of u metres, the scaled path
+of a body whose camera is right is off by up to twice |1 - u| of their distance.
 
 The scale is taken where the estimate knows it best. A state at p from the first, with covariance
 P, knows it relative to its unit with the variance v = 1 / (pᵀ P⁻¹ p), and the best linear estimate

@@ -173,11 +173,13 @@ def with_covariances_after_alignment(
         given: whether the start was given in the world of the truth.
         final_ba: the smoothed trajectory, by which the run is aligned.
     """
-    if view.truth is None or given:
+    if view.truth is None:
         return view
     camera = histories[CAUSAL].scaled_camera
     if camera is not None:  # its path is scaled, and not that of the body
         return view.at_camera(camera).aligned(histories[CAUSAL].free)
+    if given:
+        return view
     estimates = {}
     similarity = None
     for name, history in histories.items():

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from typing import ClassVar
 
 import gtsam
 import numpy as np
@@ -41,7 +42,7 @@ from slam_graph.backend.cost.measurement_rows import (
 from slam_graph.backend.cost.reprojection import Geometry, RigProjection
 from slam_graph.backend.cost.robust_loss import RobustLoss
 from slam_graph.backend.cost.triangulation import first_centres, moved_in_inverse_depth
-from slam_graph.backend.cost.unit_of_length import in_the_unit
+from slam_graph.backend.cost.unit_of_length import without_scale
 from slam_graph.backend.cost.whitened_update import TailRoot
 from slam_graph.backend.solve.square_root import Layout, SquareRootInformation
 from slam_graph.backend.solve.state import POINT_DIM, State, dims_of, landmark_keys
@@ -130,6 +131,7 @@ class Cost:
     tracks: TrackFeatures | None = None
     loss: RobustLoss | None = None
     sigma_px: FloatArray | None = None
+    defines_unit: ClassVar[bool] = False  # whether its factors say what the unit of length is
     _layout: tuple[tuple[object, ...], Layout] | None = field(default=None, init=False)  # the last
 
     @property
@@ -278,9 +280,8 @@ class Cost:
             Ab[rows, layout.indices(jacobian.keys())] = A
             Ab[rows, -1] = -factor.whitenedError(now)
             end = rows.stop
-        if self.rig.has_scale or not self.factors:
-            return Ab
-        return in_the_unit(Ab, self.state, layout, self.rig.body_p_camera[0])
+        known = self.rig.has_scale or self.defines_unit
+        return Ab if known else without_scale(Ab, self.state, layout, self.rig.body_p_camera[0])
 
     def rows(self, linear: Linearization, layout: Layout) -> list[FloatArray]:
         """Rows [A b] (m, n + 1) of all observations, to be folded in one after the other."""

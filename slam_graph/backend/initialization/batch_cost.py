@@ -23,6 +23,7 @@ from slam_graph.backend.solve.square_root import Layout
 class BatchCost(Cost):
     """The cost of a window whose features outside the state follow the poses."""
 
+    defines_unit = True
     # squared residuals (N,) of some observations at some points, where a step has led
     _moved: tuple[Observations, FloatArray, FloatArray] | None = None
     _known_rows: tuple[tuple[object, ...], FloatArray] | None = None  # of GTSAM's factors

@@ -20,12 +20,13 @@ from dataclasses import replace
 
 import gtsam
 import numpy as np
-from gtsam.symbol_shorthand import B, L, V, X
+from gtsam.symbol_shorthand import L, V, X
 
-from slam_graph.arrays import FloatArray, IntArray
+from slam_graph.arrays import IntArray
 from slam_graph.backend.aiding.regauging import gauge_directions
 from slam_graph.backend.cost.cost import Linearization
 from slam_graph.backend.cost.imu_factor import imu_factor
+from slam_graph.backend.cost.unit_of_length import scale_direction
 from slam_graph.backend.dynamics import bias_covariance
 from slam_graph.backend.engine_protocol import EngineContext
 from slam_graph.backend.initialization.batch_cost import BatchCost
@@ -40,8 +41,8 @@ from slam_graph.backend.initialization.dynamic_start import StartFrames, StartGu
 from slam_graph.backend.initialization.segment_joint import moved
 from slam_graph.backend.initialization.start_diagnosis import Refusal
 from slam_graph.backend.initialization.two_views import MIN_POINTS, TwoViews, two_view_motion
-from slam_graph.backend.solve.square_root import Layout, SquareRootInformation, triangularize
-from slam_graph.backend.solve.state import State, imu_state_keys, letter_and_index
+from slam_graph.backend.solve.square_root import SquareRootInformation, triangularize
+from slam_graph.backend.solve.state import State, imu_state_keys
 from slam_graph.backend.visual_motion import ERROR_PX
 from slam_graph.backend.window import Window
 from slam_graph.geometry import NavState
@@ -230,35 +231,6 @@ class ScaleFreeRefinement(DynamicRefinement):
             needs = f"more parallax (depths are known to {self.scale_sigma:.0%} only)"
             return Refusal("motion", needs)
         return None
-
-
-def scale_direction(
-    values: gtsam.Values, layout: Layout, centre: FloatArray, arm: FloatArray
-) -> FloatArray:
-    """Tangents (n,) of variables when the world is scaled about a point, as images allow it.
-
-    They see the camera, whose place in the body is in metres and is not scaled: so it is the path
-    of the camera that is scaled, and its velocity, and not those of the body.
-
-    Args:
-        values: of the variables, with the negative angular rate as the bias of a gyroscope.
-        layout: their columns.
-        centre: (3,) the point.
-        arm: (3,) position of the camera in the body.
-    """
-    direction = np.zeros(layout.size)
-    for key, columns in layout.columns.items():
-        kind, frame = letter_and_index(key)
-        if kind == "x":
-            pose = values.atPose3(key)
-            direction[columns][3:] = pose.rotation().unrotate(pose.transformFrom(arm) - centre)
-        elif kind == "v":
-            rate = -values.atConstantBias(B(frame)).gyroscope()
-            turning = values.atPose3(X(frame)).rotation().rotate(np.cross(rate, arm))
-            direction[columns] = values.atVector(key) + turning
-        elif kind == "l":
-            direction[columns] = values.atPoint3(key) - centre
-    return direction
 
 
 def _states(stamps_ns: list[int], poses: list[gtsam.Pose3]) -> list[NavState]:

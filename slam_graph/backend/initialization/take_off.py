@@ -27,7 +27,7 @@ _SHORTEST_S, _LONGEST_S = 1.0, 5.0
 """How long after the standstill the motion is solved at the earliest, and at the latest."""
 _MAX_SCALE_SIGMA = 0.02
 """Largest standard deviation of the scale with which the estimator goes on, relative to it."""
-_HOPELESS = 1.5
+_HOPELESS_FACTOR = 1.5
 """A motion is not solved where the filter's estimates show the scale so many times less well than
 that: of 24 solutions with which the estimator went on (`random`, `figure8`, V1_02, V2_01,
 under `msckf` and `okvis`) none had more than 1.01 times that before it."""
@@ -60,7 +60,7 @@ class TakeOff:
         self.done = False
         # the noise is that of the engine, which has learned some of it since the start
         self._refinement = DynamicRefinement(
-            context, _MAX_SCALE_SIGMA, white_noise_factor=1.0, hopeless=_HOPELESS
+            context, _MAX_SCALE_SIGMA, white_noise_factor=1.0, hopeless=_HOPELESS_FACTOR
         )
         self._states: list[NavState] = []
         self._frames: list[FeatureFrame] = []
