@@ -20,7 +20,7 @@ import slam_graph as sg
 from slam_graph.cli import view_files
 from slam_graph.errors import DataError
 from slam_graph.experiment.batch_summary import _measured
-from slam_graph.experiment.batch_task import MARK, _read_mark
+from slam_graph.experiment.batch_task import MARK, SCHEMA_VERSION, _read_mark
 from slam_graph.experiment.comparison_report import _cells, _row
 from slam_graph.experiment.comparison_results import read_result, read_series, write_result
 from slam_graph.experiment.path_thumbnail import thumbnail
@@ -178,7 +178,13 @@ def test_series_of_a_comparison_are_checked(
 
 
 def test_what_a_batch_says_of_a_run(tmp_path: Path) -> None:
-    mark = {"schema_version": 1, "name": "a", "data": "a", "status": "ok", "settings_hash": "1"}
+    mark = {
+        "schema_version": SCHEMA_VERSION,
+        "name": "a",
+        "data": "a",
+        "status": "ok",
+        "settings_hash": "1",
+    }
     (tmp_path / MARK).write_text(json.dumps(mark, indent=2))
     tried(tmp_path / MARK, lambda: _read_mark(tmp_path))
 

@@ -28,6 +28,7 @@ from slam_graph.config import algorithm_names
 from slam_graph.errors import DataError
 from slam_graph.evaluation import ape
 from slam_graph.geometry import Similarity, Trajectory
+from slam_graph.results import SavedRun
 from slam_graph.sensors import Camera, FeatureFrame, FeatureObservations, Rig, RigCamera
 from slam_graph.simulation import simulate
 from slam_graph.simulation.simulated_sequence import SimulatedSequence
@@ -275,6 +276,12 @@ def test_results_are_up_to_scale_and_say_so(tmp_path: Path) -> None:
     assert result.metrics["nees"]["alignment"] == "first_pose_and_scale"
     result.save(tmp_path)
     assert (tmp_path / "trajectory.png").is_file()
+    saved, camera = SavedRun(tmp_path), result.history.scaled_camera
+    assert saved.scaled_camera is not None
+    assert saved.scaled_camera.equals(camera, 1e-9)
+    of_camera = rms_m(saved.groundtruth.mounted(camera), saved.trajectory.mounted(camera))
+    reported = result.metrics["accuracy"]["sim3"]["ate"]["translation_m"]["rmse"]
+    assert of_camera == pytest.approx(reported, rel=1e-6)
 
 
 def test_the_unit_is_the_median_depth_that_is_asked_for() -> None:

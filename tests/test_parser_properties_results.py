@@ -32,7 +32,7 @@ from sound import sound_stamps, sound_trajectory
 
 import slam_graph as sg
 from slam_graph.experiment.batch_summary import _measured
-from slam_graph.experiment.batch_task import MARK, _read_mark
+from slam_graph.experiment.batch_task import MARK, SCHEMA_VERSION, _read_mark
 from slam_graph.experiment.comparison_report import _cells, _row
 from slam_graph.experiment.comparison_results import read_result, write_result
 from slam_graph.geometry import NavState, StateHistory
@@ -144,7 +144,13 @@ def saved(result: sg.RunResult, tmp_path_factory: pytest.TempPathFactory) -> Pat
         shutil.copy(folder / "trajectory.tum", folder / name)
     ends = ",".join(map(str, result.trajectory.stamps_ns[:2]))
     (folder / "loops.csv").write_text(f"{','.join(LOOP_COLUMNS)}\n{ends},1\n{ends},0\n")
-    mark = {"schema_version": 1, "name": "a", "data": "a", "status": "ok", "settings_hash": "1"}
+    mark = {
+        "schema_version": SCHEMA_VERSION,
+        "name": "a",
+        "data": "a",
+        "status": "ok",
+        "settings_hash": "1",
+    }
     (folder / MARK).write_text(json.dumps(mark))
     return folder
 

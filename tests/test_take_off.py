@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import slam_graph as sg
-from slam_graph.backend.initialization.take_off import TakeOff
+from slam_graph.backend.initialization.take_off import RETRY_S, TakeOff, retry_s
 from slam_graph.evaluation import nees_of_run
 from slam_graph.simulation.simulated_sequence import SimulatedSequence
 
@@ -154,3 +154,20 @@ def test_states_before_stay_where_fixes_tell_the_world(monkeypatch: pytest.Monke
     without = sg.run(sequence, algorithm="msckf", overrides=overrides)
     assert result.georeferenced
     assert len(result.trajectory) == len(without.trajectory)
+
+
+@pytest.mark.parametrize("missing", [1.2, 3.0, 16.0, 200.0])
+@pytest.mark.parametrize("elapsed_s", [1.0, 2.5])
+def test_an_attempt_follows_as_soon_as_the_scale_can_be_known(
+    elapsed_s: float, missing: float
+) -> None:
+    """Where its deviation falls with the fourth power of time, and not a whole retry before."""
+    known_s = elapsed_s * missing**0.25 - elapsed_s
+    waited_s = retry_s(elapsed_s, missing)
+    assert waited_s <= max(known_s, RETRY_S)
+    assert waited_s >= known_s - RETRY_S - 1e-9  # rounding
+
+
+def test_without_a_deviation_or_with_one_that_is_small_the_next_attempt_is_soon() -> None:
+    assert retry_s(3.0, float("inf")) == RETRY_S
+    assert retry_s(3.0, 0.5) == RETRY_S

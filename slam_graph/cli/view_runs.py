@@ -111,9 +111,12 @@ def _compared(
 
     from slam_graph.evaluation import ape
 
-    position = ape(reference, run.trajectory, "trans_part", run.unmeasured)
-    rotation = ape(reference, run.trajectory, "angle_deg", run.unmeasured)
-    moved = position.similarity.apply(run.trajectory)
+    estimate, camera = run.trajectory, run.scaled_camera
+    if camera is not None:  # its path is scaled, and not that of the body
+        reference, estimate = reference.mounted(camera), estimate.mounted(camera)
+    position = ape(reference, estimate, "trans_part", run.unmeasured)
+    rotation = ape(reference, estimate, "angle_deg", run.unmeasured)
+    moved = position.similarity.apply(estimate)
     return {
         "path": moved.positions,
         "time_s": np.asarray((position.stamps_ns - start_ns) * 1e-9, np.float64),

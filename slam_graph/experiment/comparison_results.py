@@ -37,7 +37,7 @@ from slam_graph.files import Files
 from slam_graph.geometry import AlignmentMode, Trajectory
 from slam_graph.results import ResultFolder, RunResult, SavedRun
 
-SCHEMA_VERSION = 3
+SCHEMA_VERSION = 4
 
 ALIGNMENTS: tuple[AlignmentMode, ...] = ("none", "yaw", "se3", "sim3")
 

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from slam_graph.loop_closure import LoopClosures
     from slam_graph.results.run_logs import RunLogs
 
-SCHEMA_VERSION = 2
+SCHEMA_VERSION = 3
 """Counts up whenever a key changes its name or meaning."""
 
 _RECORDED_PACKAGES = ("gtsam", "numpy", "opencv-python-headless", "scipy")

@@ -32,6 +32,8 @@ from slam_graph.results.saved_metrics import fault_of_metrics, read_metrics
 from slam_graph.sensors import Rig
 
 if TYPE_CHECKING:
+    import gtsam
+
     from slam_graph.maps import SlamMap
 
 
@@ -244,6 +246,12 @@ class SavedRun(RunSummary):
         """Estimated time over the time asked for, from 0 to 1."""
         return float(self.metrics["extent"]["coverage"])
 
+    @property
+    def scaled_camera(self) -> gtsam.Pose3 | None:
+        """body_T_camera of the camera whose path is known up to a scale; None for metres."""
+        unknown = self.metrics["extent"].get("scale") == "unknown"
+        return self.rig.cameras[0].body_T_camera if unknown else None
+
     def _known_map(self) -> SlamMap | None:
         return self.slam_map
 
@@ -261,6 +269,8 @@ class SavedRun(RunSummary):
             self.points,
             self.metrics["extent"]["start_ns"],
         )
+        if self.scaled_camera is not None and view.truth is not None:
+            view = view.at_camera(self.scaled_camera)
         mode = self.metrics["extent"].get("alignment", "yaw")
         view = view if self.start_was_given else view.aligned(mode)
         return with_path_in_map(view, self.in_map)

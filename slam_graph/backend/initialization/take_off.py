@@ -32,10 +32,10 @@ _HOPELESS_FACTOR = 1.5
 that: of 24 solutions with which the estimator went on (`random`, `figure8`, V1_02, V2_01,
 under `msckf` and `okvis`) none had more than 1.01 times that before it."""
 _FASTEST_GAIN = 4.0
-"""The standard deviation of the scale falls at most with this power of the time since the
-standstill: the way grows with its square under a constant acceleration, and the directions to the
-features change with the way. On good flights it was 2 to 3.4. So a scale that is far from known is
-not asked for again before it can be known; under a wrong calibration it often never is."""
+"""The standard deviation of the scale is taken to fall at most with this power of the time since
+the standstill: the way grows with its square under a constant acceleration, and the directions to
+the features change with the way. On good flights it was 2 to 3.4 (five pairs of attempts). Motion
+that begins later lets it fall faster; its solution then comes later, by up to the wait."""
 _MOST_FRAMES = 40
 """About the most frames of the batch problem; where there are more, not all are used."""
 _MIN_FRAMES = 3
@@ -97,18 +97,10 @@ class TakeOff:
         if self.done or few or state.stamp_ns < self._next_ns:
             return None
         window = self._solution(dynamic)
-        self._next_ns = state.stamp_ns + round(self._retry_s() * 1e9)
+        missing = self._refinement.scale_sigma / _MAX_SCALE_SIGMA
+        self._next_ns = state.stamp_ns + round(retry_s(self.elapsed_ns * 1e-9, missing) * 1e9)
         self.done = window is not None
         return window
-
-    def _retry_s(self) -> float:
-        """Time from an attempt until the scale can be known, in whole times of the shortest."""
-        missing = self._refinement.scale_sigma / _MAX_SCALE_SIGMA
-        if not math.isfinite(missing):
-            return RETRY_S
-        grown = math.pow(missing, 1.0 / _FASTEST_GAIN)
-        wait_s = self.elapsed_ns * 1e-9 * (grown - 1.0)
-        return RETRY_S * max(wait_s // RETRY_S, 1.0)
 
     def _solution(self, dynamic: IntArray) -> Window | None:
         """The window that begins with the last frame; None if the scale is not known yet."""
@@ -125,3 +117,17 @@ class TakeOff:
         guess = StartGuess(states, ids[lengths >= _MIN_FRAMES])
         found = self._refinement.refine(frames, guess, first=states[0])
         return None if isinstance(found, Refusal) else found
+
+
+def retry_s(elapsed_s: float, missing: float) -> float:
+    """Time from an attempt to the next, in seconds: whole times of `RETRY_S`.
+
+    Args:
+        elapsed_s: time since the standstill.
+        missing: how many times too large the standard deviation of the scale was; infinite if the
+            attempt did not come so far.
+    """
+    if not math.isfinite(missing):
+        return RETRY_S
+    grown = math.pow(missing, 1.0 / _FASTEST_GAIN)
+    return RETRY_S * max(elapsed_s * (grown - 1.0) // RETRY_S, 1.0)
