@@ -16,9 +16,11 @@ A plugin that cannot be imported raises an error only where its name is used.
 from __future__ import annotations
 
 import importlib
+import sys
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from importlib.metadata import EntryPoint, entry_points
+from functools import lru_cache
+from importlib.metadata import EntryPoint, EntryPoints, entry_points
 from threading import RLock
 from typing import Any, Generic, TypeVar
 
@@ -174,7 +176,7 @@ class Registry(Mapping[str, PartT], Generic[PartT]):
         """Entry points by name, read once; nothing is imported."""
         if self._plugins is None:
             self._plugins = {}
-            for entry in entry_points(group=self.group):
+            for entry in _all_entry_points(tuple(sys.path)).select(group=self.group):
                 same = self._plugins.setdefault(entry.name, [])
                 if entry not in same:  # a package may be found twice on the path
                     same.append(entry)
@@ -199,6 +201,12 @@ class Registry(Mapping[str, PartT], Generic[PartT]):
             raise ConfigError(f"{what}: expected a {self.kind}, got {type(part).__name__}")
         checked: PartT = part
         return checked
+
+
+@lru_cache(1)
+def _all_entry_points(path: tuple[str, ...]) -> EntryPoints:
+    """What all packages on the path offer: a search looks at every one, whatever the group."""
+    return entry_points()
 
 
 def _package(entry: EntryPoint) -> str:

@@ -26,8 +26,11 @@ def main() -> None:
     for number in (signal.SIGINT, signal.SIGTERM):
         if heard or number == signal.SIGTERM:
             signal.signal(number, _leave)
+    gc.disable()  # imports leave no garbage, and each collection would look at all of them
     from slam_graph.cli.main import run_command
 
+    gc.freeze()
+    gc.enable()
     if heard:
         signal.signal(signal.SIGINT, signal.default_int_handler)
     signal.signal(signal.SIGTERM, signal.SIG_DFL)

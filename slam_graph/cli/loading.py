@@ -14,9 +14,9 @@ from typing import Any
 
 from slam_graph.interrupts import Interrupts
 
-_UNUSED = ("f2py", "testing")
-"""Parts of NumPy that SciPy imports because it copies all names of NumPy; nobody uses them, and
-they take half as long as all of `scipy.linalg`."""
+_UNUSED = ("f2py", "ma", "testing")
+"""Parts of NumPy that SciPy imports because it copies all names of NumPy; hardly anybody uses them,
+and they take longer than half of `scipy.linalg`."""
 
 
 @contextmanager

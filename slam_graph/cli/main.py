@@ -12,6 +12,7 @@ from __future__ import annotations
 import os
 import signal
 import sys
+from copy import copy
 from pathlib import Path
 from types import FrameType
 from typing import Annotated
@@ -43,6 +44,8 @@ from slam_graph.version import __version__
 # The matrices of a window are a few hundred wide. BLAS threads make these slower, up to ten times
 # where other work shares the cores. OpenBLAS reads this when NumPy is first imported.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+# Nothing here is for plugins of pydantic, and it would look at all installed packages for some.
+os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
 
 config_app = typer.Typer(
     help="Show, describe and check configurations.", no_args_is_help=True, rich_markup_mode="rich"
@@ -125,6 +128,17 @@ def _global_options(
     """Options before the command."""
 
 
+def _with_one_command(name: str = "") -> typer.Typer:
+    """The program with one command only, or with all if there is none of this name.
+
+    Typer makes the options of all commands that it is given, which takes a tenth of a second.
+    """
+    alone = copy(app)
+    alone.registered_commands = [c for c in app.registered_commands if c.name == name]
+    alone.registered_groups = [group for group in app.registered_groups if group.name == name]
+    return alone if alone.registered_commands or alone.registered_groups else app
+
+
 def run_command() -> int | str:
     """Run a command; a `SlamGraphError` becomes one line on stderr and its exit code.
 
@@ -143,7 +157,7 @@ def run_command() -> int | str:
     Interrupts.terminate_like_interrupt()
     code: int | str = 0
     try:
-        app(prog_name="slam-graph")
+        _with_one_command(*sys.argv[1:2])(prog_name="slam-graph")
     except SystemExit as leaving:
         code = leaving.code or 0
     except KeyboardInterrupt:
