@@ -20,7 +20,7 @@ import sys
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import lru_cache
-from importlib.metadata import EntryPoint, EntryPoints, entry_points
+from importlib.metadata import EntryPoint, entry_points
 from threading import RLock
 from typing import Any, Generic, TypeVar
 
@@ -121,8 +121,9 @@ class Registry(Mapping[str, PartT], Generic[PartT]):
         return name in self._names or name in self._own() or name in self._offered()
 
     def __iter__(self) -> Iterator[str]:
-        own = self._parts if self._names else self._own()
-        yield from dict.fromkeys([*self._names, *own, *self._offered()])
+        own = dict.fromkeys([*self._names, *(self._parts if self._names else self._own())])
+        yield from own  # plugins are looked for when they are reached
+        yield from [name for name in self._offered() if name not in own]
 
     def __len__(self) -> int:
         return len(list(iter(self)))
@@ -204,8 +205,11 @@ class Registry(Mapping[str, PartT], Generic[PartT]):
 
 
 @lru_cache(1)
-def _all_entry_points(path: tuple[str, ...]) -> EntryPoints:
-    """What all packages on the path offer: a search looks at every one, whatever the group."""
+def _all_entry_points(path: tuple[str, ...]) -> Any:
+    """What all packages on the path offer: a search looks at every one, whatever the group.
+
+    Its class depends on the version of Python; `select` finds those of a group in any.
+    """
     return entry_points()
 
 

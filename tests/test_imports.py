@@ -21,7 +21,7 @@ NOT_BEFORE_THE_FIRST_FRAME = (
     *OPTIONAL,
     *DRAWING,
     *("scipy.optimize", "scipy.integrate", "scipy.interpolate", "scipy.ndimage"),
-    *("numpy.f2py.f2py2e", "unittest"),
+    *("numpy.f2py.f2py2e", "numpy.ma.core", "numpy.polynomial.polynomial", "unittest"),
     "slam_graph.evaluation.absolute_pose_error",
     "slam_graph.backend.smoothing.final_adjustment",
     "slam_graph.loop_closure.loop_closing",
@@ -53,6 +53,20 @@ def track(self):
 Tracking.in_turn = track
 """
 """Ends a run where its first frame would be read."""
+
+POSTPONED = """
+import sys
+from slam_graph.cli.loading import loading
+with loading():
+    import numpy as np
+assert {"numpy.ma", "numpy.polynomial"} <= sys.modules.keys()
+assert not {"numpy.ma.core", "numpy.polynomial.polynomial"} & sys.modules.keys()
+import numpy.ma.extras
+from numpy.polynomial.polynomial import polyval
+assert polyval(2.0, [1.0, 3.0]) == np.polynomial.Polynomial([1.0, 3.0])(2.0) == 7.0
+assert numpy.ma.extras.average(np.ma.array([1.0, 2.0], mask=[True, False])) == 2.0
+"""
+"""Uses parts of NumPy whose import is postponed, by a module of theirs first."""
 
 
 def imported(*arguments: str, before: str = "") -> set[str]:
@@ -88,3 +102,7 @@ def test_optimization_needs_no_estimator(tmp_path: Path, dimension: int) -> None
 
 def test_help_imports_nothing_heavy() -> None:
     assert not imported("run", "--help").intersection(NOT_FOR_HELP)
+
+
+def test_what_is_postponed_is_there_when_it_is_used() -> None:
+    subprocess.run([sys.executable, "-c", POSTPONED], timeout=300, check=True)

@@ -14,7 +14,7 @@ from typing import Any
 
 from slam_graph.interrupts import Interrupts
 
-_UNUSED = ("f2py", "ma", "testing")
+_UNUSED = ("f2py", "ma", "polynomial", "testing")
 """Parts of NumPy that SciPy imports because it copies all names of NumPy; hardly anybody uses them,
 and they take longer than half of `scipy.linalg`."""
 
@@ -48,17 +48,19 @@ def loading(text: str = "loading") -> Iterator[None]:
 
 
 class _Postponed(ModuleType):
-    """A module that is executed when the first of its names is used.
+    """A package that is executed when the first of its names or modules is used.
 
     Unlike that of `importlib.util.LazyLoader` it is not executed by `inspect`, which looks at the
     file of every module.
     """
 
     def __getattr__(self, name: str) -> Any:
-        if name.startswith("__") or self.__spec__ is None or self.__spec__.loader is None:
+        spec = self.__spec__
+        if (name.startswith("__") and name != "__path__") or spec is None or spec.loader is None:
             raise AttributeError(f"module {self.__name__!r} has no attribute {name!r}", name=name)
         self.__class__ = ModuleType  # type: ignore[assignment]  # a plain module from now on
-        self.__spec__.loader.exec_module(self)
+        self.__path__ = spec.submodule_search_locations or []
+        spec.loader.exec_module(self)
         return getattr(self, name)
 
 
@@ -71,5 +73,6 @@ def _postpone_unused() -> None:
         spec = None if name in sys.modules else find_spec(name)
         if spec is not None:
             module = sys.modules[name] = module_from_spec(spec)
+            del module.__path__  # who imports a module of the package asks for it
             module.__class__ = _Postponed
             setattr(np, part, module)
