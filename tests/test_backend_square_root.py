@@ -7,7 +7,7 @@ import pytest
 
 from slam_graph.arrays import FloatArray
 from slam_graph.backend.solve.square_root import Layout, SquareRootInformation, triangularize
-from slam_graph.backend.solve.triangles import upper_part
+from slam_graph.backend.solve.triangles import transposed_inverse, upper_part
 
 DIMS = {10: 3, 11: 6, 12: 1, 13: 3, 14: 2}
 SIZE = sum(DIMS.values())
@@ -233,3 +233,12 @@ def test_covariance_is_the_inverse_of_the_information(size: int) -> None:
         rtol=1e-9,
         atol=1e-12,
     )
+
+
+@pytest.mark.parametrize("n", [1, 40, 64, 65, 150])
+def test_the_inverse_of_a_triangle_is_one(n: int) -> None:
+    """Whatever is below the diagonal."""
+    values = np.asfortranarray(np.random.default_rng(n).normal(size=(n, n)) + 9.0 * np.eye(n))
+    inverse = transposed_inverse(values)
+    np.testing.assert_allclose(inverse.T @ np.triu(values), np.eye(n), atol=1e-12)
+    np.testing.assert_array_equal(inverse, np.tril(inverse))

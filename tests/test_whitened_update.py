@@ -5,7 +5,8 @@
 import numpy as np
 import pytest
 
-from slam_graph.backend.cost.whitened_update import TailRoot, WhitenedUpdate
+from slam_graph.backend.cost.gating import distances_of_rows, squared_mahalanobis
+from slam_graph.backend.cost.whitened_update import GatedRows, TailRoot, WhitenedUpdate
 from slam_graph.backend.solve.square_root import Layout, SquareRootInformation
 
 
@@ -20,9 +21,34 @@ def test_mean_and_covariance_are_those_of_an_update_by_qr() -> None:
     after = before.updated(Ab)
     columns = np.array([95, 31, 60])
     expected = after.covariance()[np.ix_(columns, columns)]
-    np.testing.assert_allclose(update.covariance(columns), expected, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(
+        update.covariance(root.columns(columns)), expected, rtol=1e-9, atol=1e-12
+    )
     np.testing.assert_allclose(update.solution()[first:], after.solution()[first:], atol=1e-12)
-    np.testing.assert_array_equal(root.from_column(50), root.W[20:, 20:])
+    np.testing.assert_allclose(root.W.T @ update.mean, after.solution()[first:], atol=1e-12)
+
+
+def test_distances_by_rows_are_those_by_the_covariance() -> None:
+    rng = np.random.default_rng(1)
+    Rd = np.asfortranarray(np.triu(rng.normal(size=(81, 81))) + 5.0 * np.eye(81))
+    before = SquareRootInformation(Layout(dict.fromkeys(range(8), 10)), Rd)
+    columns = np.array([rng.choice(np.arange(20, 80), 9, replace=False) for _ in range(12)])
+    H, r = rng.normal(size=(12, 2, 9)), rng.normal(size=(12, 2))
+    known = GatedRows.of(before, columns, np.arange(70, 80), H)
+    assert known.root.first == columns.min()
+    A = np.zeros((12, 2, 81))
+    A[np.arange(12)[:, None], :, columns] = H.transpose(0, 2, 1)
+    A[:, :, -1] = r
+    of_some = known.rows[:5].reshape(10, -1)
+    update = WhitenedUpdate(before, known.root, of_some, r[:5].ravel())
+    less = update.less(known.rows.reshape(24, -1)).reshape(12, 2, -1)
+    after = before.updated(A[:5].reshape(10, -1))
+    for gaussian, found in (
+        (before, distances_of_rows(r, known.rows)),
+        (after, distances_of_rows(r, known.rows, less)),
+    ):
+        P = gaussian.covariance()[columns[:, :, None], columns[:, None, :]]
+        np.testing.assert_allclose(found, squared_mahalanobis(r, H, P), rtol=1e-9)
 
 
 @pytest.mark.parametrize("where", ["rows", "right-hand side", "Gaussian"])

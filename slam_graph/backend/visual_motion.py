@@ -27,7 +27,8 @@ from scipy.spatial.transform import Rotation
 from slam_graph.arrays import BoolArray, FloatArray, IntArray
 from slam_graph.backend.backend_config import TriangulationConfig
 from slam_graph.backend.cost.feature_tracks import is_in
-from slam_graph.backend.cost.triangulation import triangulate_frames
+from slam_graph.backend.cost.reprojection import RigProjection
+from slam_graph.backend.cost.triangulation import seen_twice, triangulate
 from slam_graph.geometry import NavState
 from slam_graph.sensors import FeatureFrame, Rig, RigCamera
 
@@ -37,7 +38,7 @@ _ERRORS_PX, _SHARES = (1.5, 2.5, ERROR_PX), (0.65, 0.65, 0.5)
 """Limits of the errors, which are tried in turn, and the part of the points that must fit: what
 moves slowly, or is near, would fit a motion between its own and that of the platform."""
 _ACCEPTED = TriangulationConfig()
-"""Depths that `triangulate_frames` accepts. A feature whose parallax is not positive is put at the
+"""Depths that `triangulate` accepts. A feature whose parallax is not positive is put at the
 largest one."""
 _SAME_NS = 5_000_000
 """The last frame is used if the time since it is that since the last state, to so much."""
@@ -66,9 +67,10 @@ class KnownPoints:
 
     def seen(self, ids: IntArray) -> tuple[BoolArray, KnownPoints]:
         """Which of some features (M,) are known, and these, in their order."""
-        known = self.subset(np.argsort(self.ids))
-        rows = is_in(ids, known.ids)
-        return rows, known.subset(np.searchsorted(known.ids, ids[rows]))
+        order = self.ids.argsort()
+        ascending = self.ids.take(order)
+        rows = is_in(ids, ascending)
+        return rows, self.subset(order.take(ascending.searchsorted(ids[rows])))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -96,6 +98,7 @@ class VisualMotion:
 
     def __init__(self, rig: Rig, min_points: int) -> None:
         self._rig = rig
+        self._projection = RigProjection(rig)
         self._min_points = min_points
         self._last: FeatureFrame | None = None
         self._limit_px = 0.0
@@ -161,12 +164,15 @@ class VisualMotion:
         ids, points = known
         located = np.ones(len(ids), np.bool_)
         if last is not None:
-            again = frame.cameras[0].ids
-            again = again[~is_in(again, np.sort(ids))]
-            seen = depths_within(last.only(again), self._rig, self._rate(before))
-            world = np.asarray(before.world_T_body.transformFrom(seen.points.T)).T
+            before_ids, again = last.cameras[0].ids, frame.cameras[0].ids
+            wanted = before_ids[is_in(before_ids, np.sort(again))]
+            wanted = wanted[~is_in(wanted, np.sort(ids))]
+            rate = self._rate(before)
+            seen = depths_within(last, self._rig, rate, wanted, self._projection)
+            pose = before.world_T_body
+            world = seen.points @ pose.rotation().matrix().T + pose.translation()
             ids = np.concatenate([ids, seen.ids])
-            points = np.concatenate([points, world.reshape(-1, 3)])
+            points = np.concatenate([points, world])
             located = np.concatenate([located, seen.located])
         return KnownPoints(ids, points, located)
 
@@ -183,8 +189,11 @@ class VisualMotion:
         rows, found = known.seen(seen.ids)
         if np.count_nonzero(found.located) < self._min_points:
             return None
-        rays = _unrolled(seen.normalized[rows], seen.pixels[rows, 1], mounted, rate)
-        return pose_of_most(mounted, found.points, rays[:, :2] / rays[:, 2:], least_px, guess)
+        rays = seen.normalized[rows]
+        if mounted.readout_s != 0.0:
+            turned = _unrolled(rays, seen.pixels[rows, 1], mounted, rate)
+            rays = turned[:, :2] / turned[:, 2:]
+        return pose_of_most(mounted, found.points, rays, least_px, guess)
 
 
 def pose_of_most(
@@ -226,15 +235,18 @@ def _unrolled(
         mounted: the camera.
         rate: (3,) angular rate of the body, rad/s.
     """
-    rays = np.column_stack([normalized, np.ones(len(normalized))])
-    if mounted.readout_s == 0.0:
-        return rays
     seconds = mounted.row_times_s(rows) - mounted.middle_s
     turn = mounted.body_T_camera.rotation().unrotate(rate)
-    return np.asarray(Rotation.from_rotvec(seconds[:, None] * turn).apply(rays))
+    return np.asarray(Rotation.from_rotvec(seconds[:, None] * turn).apply(_on_plane(normalized)))
 
 
-def depths_within(frame: FeatureFrame, rig: Rig, rate: FloatArray | None = None) -> KnownPoints:
+def depths_within(
+    frame: FeatureFrame,
+    rig: Rig,
+    rate: FloatArray | None = None,
+    wanted: IntArray | None = None,
+    projection: RigProjection | None = None,
+) -> KnownPoints:
     """Positions in the body frame of features that two cameras see, or one and a depth sensor.
 
     Args:
@@ -242,29 +254,44 @@ def depths_within(frame: FeatureFrame, rig: Rig, rate: FloatArray | None = None)
         rig: its cameras.
         rate: (3,) angular rate of the body, rad/s, by which rows of a rolling shutter differ; None
             for none.
+        wanted: features (N,) of the first camera; None for all that it sees.
+        projection: into the cameras, if there is one already.
 
     Returns:
-        All of them, located or not.
+        All of them, located or not, by ascending ids.
     """
-    seen, mounted = frame.cameras[0], rig.cameras[0]
-    if len(rig.cameras) < 2 or len(seen.ids) == 0:
-        return KnownPoints(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros(0, np.bool_))
-    found = triangulate_frames(seen.ids, [frame], np.eye(3)[None], np.zeros((1, 3)), rig)
-    twice = np.isfinite(found.depth_error)
-    rays = np.column_stack([seen.normalized, np.ones(len(twice))])[twice]
-    camera = mounted.body_T_camera
-    depths = np.asarray(camera.transformTo(found.points[twice].T))[2]
-    usable = found.good[twice] | (
-        (depths > _ACCEPTED.min_depth_m) & (depths < _ACCEPTED.max_depth_m)
-    )
-    far = np.asarray(camera.transformFrom(_ACCEPTED.max_depth_m * rays.T)).T
-    points = np.where(usable[:, None], found.points[twice], far)
-    known = KnownPoints(seen.ids[twice], points, found.good[twice])
+    mounted = rig.cameras[0]
+    ids = np.sort(frame.cameras[0].ids if wanted is None else wanted)
+    if len(rig.cameras) < 2 or len(ids) == 0:
+        return _no_points()
+    obs = seen_twice(ids, frame)
+    if len(obs) == 0:
+        return _no_points()
+    projection = projection or RigProjection(rig)
+    found = triangulate(obs, projection, np.eye(3)[None], np.zeros((1, 3)), _ACCEPTED)
+    first = obs.starts[:-1]
+    rays = _on_plane(obs.normalized.take(first, axis=0))
+    R, p = projection.body_R_camera[0], projection.body_p_camera[0]
+    depths = (found.points - p) @ R[:, 2]
+    usable = found.good | ((depths > _ACCEPTED.min_depth_m) & (depths < _ACCEPTED.max_depth_m))
+    far = _ACCEPTED.max_depth_m * rays @ R.T + p
+    points = np.where(usable[:, None], found.points, far)
     if rate is not None and mounted.readout_s != 0.0:
-        seconds = mounted.row_times_s(seen.pixels[twice, 1]) - mounted.middle_s
-        turned = Rotation.from_rotvec(seconds[:, None] * rate).apply(known.points)
-        known = replace(known, points=turned)
-    return known
+        seconds = mounted.row_times_s(obs.pixels[first, 1]) - mounted.middle_s
+        points = np.asarray(Rotation.from_rotvec(seconds[:, None] * rate).apply(points))
+    known, finite = KnownPoints(obs.ids, points, found.good), np.isfinite(found.depth_error)
+    return known if finite.all() else known.subset(finite)
+
+
+def _no_points() -> KnownPoints:
+    return KnownPoints(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros(0, np.bool_))
+
+
+def _on_plane(normalized: FloatArray) -> FloatArray:
+    """Rays (N, 3) of points (N, 2) on the plane z = 1."""
+    rays = np.ones((len(normalized), 3))
+    rays[:, :2] = normalized
+    return rays
 
 
 def moved_to(

@@ -18,7 +18,7 @@ from slam_graph.frontend.frontend_protocol import Feedback, FrameStats
 from slam_graph.frontend.image_rotation import ImageRotation
 from slam_graph.frontend.keypoints import Image, Tracks
 from slam_graph.frontend.lost_features import LostFeatures
-from slam_graph.frontend.lucas_kanade import BLUR_PER_PX
+from slam_graph.frontend.lucas_kanade import BLUR_PER_PX, lengths
 from slam_graph.frontend.moving_tracks import MovingTracks
 from slam_graph.frontend.outliers import MIN_POINTS, coherent_groups, map_inliers
 from slam_graph.frontend.prediction import MAX_TANGENT, PointPredictor
@@ -224,7 +224,7 @@ class CameraTracker:
         if self._lost is None or len(rows) == 0:
             return 1.0
         moved = after.pixels - before.pixels.take(rows, axis=0)
-        moved_px = float(median(np.linalg.norm(moved, axis=1)))
+        moved_px = float(median(lengths(moved)))
         return 1.0 + BLUR_PER_PX * moved_px / self._config.epipolar_px
 
     def _rigid_motions(self, before: FloatArray, after: FloatArray, scale: float) -> list[IntArray]:

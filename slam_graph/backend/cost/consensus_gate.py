@@ -18,22 +18,22 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from slam_graph.arrays import BoolArray, FloatArray, median
 from slam_graph.backend.cost.cost import Cost, Linearization
 from slam_graph.backend.cost.feature_factors import WhitenedObservations, sum_features
+from slam_graph.backend.cost.feature_tracks import Observations
 from slam_graph.backend.cost.gating import (
     Gate,
+    distances_of_rows,
     distances_of_tracks,
-    squared_mahalanobis,
     threshold,
 )
+from slam_graph.backend.cost.measurement_rows import gated_columns
 from slam_graph.backend.cost.robust_loss import MEDIAN_2D, WIDTH_2D
-from slam_graph.backend.cost.whitened_update import TailRoot, WhitenedUpdate
+from slam_graph.backend.cost.whitened_update import GatedRows, WhitenedUpdate
 from slam_graph.backend.solve.square_root import SquareRootInformation
 from slam_graph.backend.solve.state import POINT_DIM
-from slam_graph.kernels.gate import observation_rows
 
 _FEWEST, _LEAST_SHARE = 10, 0.5
 """Where fewer features fit, or a smaller part of all, there is no consensus. Counted before the
@@ -74,78 +74,66 @@ def gate_by_consensus(
     consensus = _consensus(cost, linear)
     if consensus is None:
         return cost.gate(linear, predicted, tested)
-    columns = _Columns.of(cost, linear, predicted)
-    root = TailRoot.of(predicted, columns.first)
+    known = _gated_rows(cost, linear, predicted)
     try:
-        update = WhitenedUpdate(predicted, root, *_rows(cost, linear, columns, root, consensus))
+        update = WhitenedUpdate(predicted, known.root, *_rows(cost, linear, known, consensus))
     except np.linalg.LinAlgError:
         return cost.gate(linear, predicted, tested)
-    after = _after(cost, linear, update.solution(), columns)
-    landmarks = consensus.landmarks | _landmarks_pass(after, update, columns)
+    landmarks = consensus.landmarks | _landmarks_pass(linear, update, known)
     others = ~consensus.tracks if tested is None else tested & ~consensus.tracks
-    tracks = consensus.tracks | _tracks_pass(cost, after, update, columns, others)
+    tracks = consensus.tracks | _tracks_pass(cost, linear, update, known, others)
     admitted = landmarks, tracks if tested is None else tracks[tested]
-    return cost.gate(linear, predicted, tested, admitted=admitted, root=root)
+    return cost.gate(linear, predicted, tested, admitted=admitted, known=known)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Columns:
-    """Which columns observations have.
-
-    Attributes:
-        landmarks: (N, 9 + C) of observations of features of the state.
-        poses: (6 F + C,) of poses and calibration of new features.
-        first: the first of all.
-    """
-
-    landmarks: NDArray[np.intp]
-    poses: NDArray[np.intp]
-    first: int
-
-    @staticmethod
-    def of(cost: Cost, linear: Linearization, predicted: SquareRootInformation) -> _Columns:
-        """Those of a cost."""
-        layout = predicted.layout
-        obs = None if linear.tracks is None or cost.tracks is None else cost.tracks.obs
-        landmarks, poses = cost.gated_columns(linear, layout, obs)
-        first = min(int(part.min(initial=layout.size)) for part in (landmarks, poses))
-        return _Columns(landmarks, poses, first)
+def _gated_rows(cost: Cost, linear: Linearization, predicted: SquareRootInformation) -> GatedRows:
+    """What both tests need of all observations."""
+    landmarks = None if linear.landmarks is None else cost.landmarks
+    tracks = None if linear.tracks is None or cost.tracks is None else cost.tracks.obs
+    columns, poses = gated_columns(landmarks, tracks, cost.rig, predicted.layout)
+    H = np.zeros((0, 2, 9)) if linear.landmarks is None else linear.landmarks.H
+    return GatedRows.of(predicted, columns, poses, H)
 
 
-def _landmarks_pass(after: Linearization, update: WhitenedUpdate, columns: _Columns) -> BoolArray:
+def _landmarks_pass(linear: Linearization, update: WhitenedUpdate, known: GatedRows) -> BoolArray:
     """Which observations (N,) of features of the state fit what is known with the consensus.
 
     The distance of a residual is at most its square. Only for what is larger than the limit the
     covariance is wanted.
     """
-    if after.landmarks is None:
+    if linear.landmarks is None:
         return np.zeros(0, np.bool_)
-    r, H = after.landmarks.r, after.landmarks.H
+    rows = known.rows.reshape(-1, len(update.mean))
+    r = linear.landmarks.r - (rows @ update.mean).reshape(-1, 2)
     limit = threshold(np.array([2]), _CONFIDENCE)[0]
     passed: BoolArray = np.einsum("ni,ni->n", r, r) < limit
     large = (~passed).nonzero()[0]
     if len(large):
-        used, places = np.unique(columns.landmarks[large], return_inverse=True)
-        places = places.reshape(len(large), -1)
-        P = update.covariance(used)[places[:, :, None], places[:, None, :]]
-        passed[large] = squared_mahalanobis(r[large], H[large], P) < limit
+        of_large = known.rows.take(large, axis=0)
+        less = update.less(of_large.reshape(-1, rows.shape[1])).reshape(len(large), 2, -1)
+        passed[large] = distances_of_rows(r[large], of_large, less) < limit
     return passed
 
 
 def _tracks_pass(
-    cost: Cost, after: Linearization, update: WhitenedUpdate, columns: _Columns, tested: BoolArray
+    cost: Cost,
+    linear: Linearization,
+    update: WhitenedUpdate,
+    known: GatedRows,
+    tested: BoolArray,
 ) -> BoolArray:
     """Which new features (J,) fit what is known with the consensus, of those that are tested."""
-    if after.tracks is None or cost.tracks is None:
+    if linear.tracks is None or cost.tracks is None:
         return tested
-    assert isinstance(after.tracks, WhitenedObservations)
-    obs, squares = cost.tracks.obs, np.einsum("ni,ni->n", after.tracks.r, after.tracks.r)
+    after, obs = _tracks_after(cost.tracks.obs, linear, update, known), cost.tracks.obs
+    squares = np.einsum("ni,ni->n", after.r, after.r)
     limits = threshold(2 * obs.counts - POINT_DIM, _CONFIDENCE)
     large = tested & (np.add.reduceat(squares, obs.starts[:-1]) >= limits)
     passed = tested & ~large
     if large.any():
-        linear = after.tracks.subset(large[obs.feature])
-        distances = distances_of_tracks(obs.subset(large), linear, update.covariance(columns.poses))
+        of_large = after.subset(large[obs.feature])
+        covariance = update.covariance(known.pose_root)
+        distances = distances_of_tracks(obs.subset(large), of_large, covariance)
         passed[large] = distances < limits[large]
     return passed
 
@@ -188,40 +176,36 @@ def _of_features(cost: Cost, linear: Linearization) -> tuple[FloatArray, FloatAr
 
 
 def _rows(
-    cost: Cost, linear: Linearization, columns: _Columns, root: TailRoot, consensus: _Consensus
+    cost: Cost, linear: Linearization, known: GatedRows, consensus: _Consensus
 ) -> tuple[FloatArray, FloatArray]:
     """Rows [Y b] of the consensus by whitened variables, of new features those of the poses."""
-    Y, b = [np.zeros((0, len(root.W)))], [np.zeros(0)]
+    m = len(known.root.W)
+    Y, b = [np.zeros((0, m))], [np.zeros(0)]
     if linear.landmarks is not None:
-        chosen = linear.landmarks.subset(consensus.landmarks)
-        Y.append(np.empty((2 * len(chosen.r), len(root.W))))
-        own = columns.landmarks[consensus.landmarks] - root.first
-        observation_rows(chosen.H, np.asfortranarray(root.W), own, Y[-1])
-        b.append(chosen.r.ravel())
+        chosen = consensus.landmarks.nonzero()[0]
+        Y.append(known.rows.take(chosen, axis=0).reshape(-1, m))
+        b.append(linear.landmarks.r.take(chosen, axis=0).ravel())
     if linear.tracks is not None and cost.tracks is not None and consensus.tracks.any():
         assert isinstance(linear.tracks, WhitenedObservations)
         observed = linear.tracks.subset(consensus.tracks[cost.tracks.obs.feature])
         rows = sum_features(cost.tracks.obs.subset(consensus.tracks), observed).rows
-        Y.append(rows[:, :-1] @ root.columns(columns.poses).T)
+        by_poses = np.zeros((len(rows), m))
+        by_poses[:, m - len(known.pose_root) :] = rows[:, :-1] @ known.pose_root.T
+        Y.append(by_poses)
         b.append(rows[:, -1])
     return np.concatenate(Y), np.concatenate(b)
 
 
-def _after(
-    cost: Cost, linear: Linearization, moved: FloatArray, columns: _Columns
-) -> Linearization:
-    """The linearisation with the residuals after an increment (n,) of the variables.
+def _tracks_after(
+    obs: Observations, linear: Linearization, update: WhitenedUpdate, known: GatedRows
+) -> WhitenedObservations:
+    """New features with the residuals after the increment of poses and calibration.
 
-    Those of new features are after it of poses and calibration; the gate eliminates their points.
+    The gate eliminates their points.
     """
-    landmarks, tracks = linear.landmarks, linear.tracks
-    if landmarks is not None:
-        r = landmarks.r - np.einsum("nij,nj->ni", landmarks.H, moved[columns.landmarks])
-        landmarks = replace(landmarks, r=r)
-    if tracks is not None and cost.tracks is not None:
-        assert isinstance(tracks, WhitenedObservations)
-        obs = cost.tracks.obs
-        poses, common = np.split(moved[columns.poses], [6 * len(obs.frames)])
-        r = tracks.r - np.einsum("nij,nj->ni", tracks.by_pose, poses.reshape(-1, 6)[obs.frame])
-        tracks = replace(tracks, r=r - tracks.by_calibration @ common)
-    return Linearization(landmarks, tracks, linear.errors)
+    tracks = linear.tracks
+    assert isinstance(tracks, WhitenedObservations)
+    moved = update.solution()[known.poses]
+    poses, common = np.split(moved, [6 * len(obs.frames)])
+    r = tracks.r - np.einsum("nij,nj->ni", tracks.by_pose, poses.reshape(-1, 6)[obs.frame])
+    return replace(tracks, r=r - tracks.by_calibration @ common)

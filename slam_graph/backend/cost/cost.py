@@ -15,7 +15,6 @@ from typing import ClassVar
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
 from slam_graph.arrays import BoolArray, FloatArray, IntArray
 from slam_graph.backend.backend_config import BackendConfig
@@ -30,11 +29,12 @@ from slam_graph.backend.cost.gating import (
     Gate,
     Innovations,
     distances_of_observations,
+    distances_of_rows,
     distances_of_tracks,
     threshold,
 )
 from slam_graph.backend.cost.measurement_rows import (
-    columns_of_state,
+    gated_columns,
     pose_rows,
     starts_of_points,
     state_feature_rows,
@@ -43,7 +43,7 @@ from slam_graph.backend.cost.reprojection import Geometry, RigProjection
 from slam_graph.backend.cost.robust_loss import RobustLoss
 from slam_graph.backend.cost.triangulation import first_centres, moved_in_inverse_depth
 from slam_graph.backend.cost.unit_of_length import without_scale
-from slam_graph.backend.cost.whitened_update import TailRoot
+from slam_graph.backend.cost.whitened_update import GatedRows
 from slam_graph.backend.solve.square_root import Layout, SquareRootInformation
 from slam_graph.backend.solve.state import POINT_DIM, State, dims_of, landmark_keys
 
@@ -337,7 +337,7 @@ class Cost:
         predicted: SquareRootInformation,
         tested: BoolArray | None = None,
         admitted: tuple[BoolArray | bool, BoolArray | bool] = (True, True),
-        root: TailRoot | None = None,
+        known: GatedRows | None = None,
     ) -> Gate:
         """Which tracked observations and new features pass the χ² test.
 
@@ -347,20 +347,26 @@ class Cost:
             predicted: what is known of the variables before these measurements.
             tested: (J,) which of the new features are tested; all of them if it is not given.
             admitted: which observations (N,) and which of the tested features may pass; else all.
-            root: of the covariance of what they depend on, if it is known.
+            known: the rows of all of them, if they are known.
         """
         landmarks = tracks = np.zeros(0, np.bool_)
         innovations, confidence = Innovations(), self.config.gating.confidence
         obs = None if self.tracks is None or linear.tracks is None else self.tracks.obs
         if obs is not None and tested is not None:  # they are new: few poses have seen them
             obs, tracks = obs.subset(tested).without_idle_frames(), np.zeros(len(tested), np.bool_)
-        columns, of_poses = self.gated_columns(linear, predicted.layout, obs)
+        of_state = self.landmarks if linear.landmarks is not None and known is None else None
+        columns, of_poses = gated_columns(of_state, obs, self.rig, predicted.layout)
+        columns = columns if known is None else known.columns
         first = min(int(part.min(initial=predicted.layout.size)) for part in (columns, of_poses))
         if first == predicted.layout.size:  # no observations
             return Gate(landmarks, tracks, innovations)
-        W = predicted.root_from(first) if root is None else root.from_column(first)
+        first = first if known is None else known.root.first
+        W = predicted.root_from(first) if known is None else known.root.W
         if linear.landmarks is not None and self.landmarks is not None:
-            distance = distances_of_observations(linear.landmarks, W, columns - first)
+            if known is None:
+                distance = distances_of_observations(linear.landmarks, W, columns - first)
+            else:
+                distance = distances_of_rows(linear.landmarks.r, known.rows)
             dof = np.full(len(distance), 2)
             largest = threshold(dof, confidence)
             # nearer or behind, the slope of the projection is so large that any residual would pass
@@ -372,8 +378,11 @@ class Cost:
             assert isinstance(observations, WhitenedObservations), "these are not told apart"
             if tested is not None:
                 observations = observations.subset(tested[self.tracks.obs.feature])
-            above = int(of_poses.min()) - first  # rows before are zero: the root is triangular
-            root_of_poses = W[above:, of_poses - first]
+            if known is not None and tested is None:
+                root_of_poses = known.pose_root
+            else:
+                above = int(of_poses.min()) - first  # rows before are zero: the root is triangular
+                root_of_poses = W[above:, of_poses - first]
             covariance = root_of_poses.T @ root_of_poses
             distance = distances_of_tracks(obs, observations, covariance)
             dof = 2 * obs.counts - POINT_DIM
@@ -382,17 +391,6 @@ class Cost:
             innovations += Innovations.of(distance, dof, largest, passed)
             tracks = is_in(self.tracks.obs.ids, obs.ids[passed])
         return Gate(landmarks, tracks, innovations)
-
-    def gated_columns(
-        self, linear: Linearization, layout: Layout, obs: Observations | None
-    ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-        """Columns of observations of features of the state (N, 9 + C), and of poses of tracks."""
-        columns, of_poses = np.zeros((0, 9), np.intp), np.zeros(0, np.intp)
-        if linear.landmarks is not None and self.landmarks is not None:
-            columns = columns_of_state(self.landmarks, layout, self.rig.common_keys)
-        if obs is not None and len(obs):
-            of_poses = layout.indices(self.rig.keys_of(obs))
-        return columns, of_poses
 
 
 def _are_same(some: tuple[object, ...], others: tuple[object, ...]) -> bool:

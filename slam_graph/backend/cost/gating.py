@@ -130,6 +130,33 @@ def distances_of_observations(
     return distances
 
 
+def distances_of_rows(
+    r: FloatArray, rows: FloatArray, less: FloatArray | None = None
+) -> FloatArray:
+    """Squared Mahalanobis distances (N,) of observations, from their rows by whitened variables.
+
+    Args:
+        r: (N, 2) residuals.
+        rows: (N, 2, m) their derivatives Y by variables whose covariance is the identity.
+        less: (N, 2, k) rows Z where an update has made the covariance of Y x less, by Z Zᵀ.
+
+    Returns:
+        rᵀ (Y Yᵀ - Z Zᵀ + I)⁻¹ r.
+    """
+    s00, s01, s11 = _products(rows) if less is None else _products(rows) - _products(less)
+    s00, s11 = s00 + 1.0, s11 + 1.0
+    u, v = r.T
+    squares = s11 * u * u - 2.0 * s01 * u * v + s00 * v * v
+    return np.asarray(squares / (s00 * s11 - s01 * s01))
+
+
+def _products(rows: FloatArray) -> FloatArray:
+    """The products (3, N) of each pair (N, 2, m) of rows: first by first, by second, and second."""
+    one, other = rows[:, 0], rows[:, 1]
+    pairs = (one, one), (one, other), (other, other)
+    return np.array([np.einsum("nm,nm->n", a, b) for a, b in pairs])
+
+
 def distances_of_tracks(
     obs: Observations, linear: WhitenedObservations, covariance: FloatArray
 ) -> FloatArray:

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.backend.cost.feature_factors import SummedFeatures, WhitenedObservations
 from slam_graph.backend.cost.feature_tracks import Observations
+from slam_graph.backend.cost.reprojection import RigProjection
 from slam_graph.backend.solve.square_root import Layout, triangularize
 from slam_graph.backend.solve.state import POINT_DIM, POSE_DIM, landmark_keys
 from slam_graph.kernels.state_rows import fill_state_rows
@@ -112,3 +113,22 @@ def columns_of_state(
 def starts_of_points(obs: Observations, layout: Layout) -> NDArray[np.intp]:
     """The first column (J,) of each feature of the state; 0 of others, which have no rows."""
     return np.array([layout.starts.get(key, 0) for key in landmark_keys(obs.ids)], np.intp)
+
+
+def gated_columns(
+    landmarks: Observations | None, tracks: Observations | None, rig: RigProjection, layout: Layout
+) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Columns (N, 9 + C) of observations of features of the state, and (6 F + C,) of poses.
+
+    Args:
+        landmarks: N of features of the state; None for none.
+        tracks: of new features, which F poses have seen; None for none.
+        rig: the cameras.
+        layout: of the variables.
+    """
+    columns, poses = np.zeros((0, POSE_DIM + POINT_DIM), np.intp), np.zeros(0, np.intp)
+    if landmarks is not None:
+        columns = columns_of_state(landmarks, layout, rig.common_keys)
+    if tracks is not None and len(tracks):
+        poses = layout.indices(rig.keys_of(tracks))
+    return columns, poses

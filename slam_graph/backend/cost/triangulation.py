@@ -143,6 +143,26 @@ def triangulate_frames(
     return Triangulation(points[place], good[place], reprojection_px[place], depth_error[place])
 
 
+def seen_twice(ids: IntArray, frame: FeatureFrame) -> Observations:
+    """Observations in one frame of those of some features (ascending ids) that two cameras see.
+
+    They are those of the first camera, which must see all of the features, and of one or more
+    others; of each feature the first camera's come first.
+    """
+    cameras = frame.cameras
+    others = np.concatenate([np.zeros(0, np.int64), *(seen.ids for seen in cameras[1:])])
+    ids = ids[is_in(ids, np.sort(others))]
+    found = np.concatenate([cameras[0].ids, others])
+    camera = np.arange(len(cameras)).repeat([len(seen) for seen in cameras])
+    order = found.argsort(kind="stable")
+    rows = order[is_in(found.take(order), ids)]
+    feature = ids.searchsorted(found.take(rows))
+    pixels = np.concatenate([seen.pixels for seen in cameras]).take(rows, axis=0)
+    normalized = np.concatenate([seen.normalized for seen in cameras]).take(rows, axis=0)
+    frames = np.zeros(len(rows), np.int64)
+    return Observations(ids, (0,), feature, frames, camera.take(rows), pixels, normalized)
+
+
 def _observations(ids: IntArray, frames: Sequence[FeatureFrame]) -> Observations:
     """All observations of features (ascending ids) in some frames, in the order of time."""
     views = [

@@ -19,7 +19,7 @@ from scipy.linalg import blas, lapack
 
 from slam_graph.arrays import FloatArray
 from slam_graph.backend.solve.square_root import SquareRootInformation
-from slam_graph.backend.solve.triangles import lower_part
+from slam_graph.kernels.gate import observation_rows
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -37,20 +37,54 @@ class TailRoot:
     @staticmethod
     def of(gaussian: SquareRootInformation, first: int) -> TailRoot:
         """That of all columns from one on."""
-        return TailRoot(first, lower_part(gaussian.root_from(first)))
-
-    def from_column(self, first: int) -> FloatArray:
-        """The root of the columns from a later one on."""
-        skipped = first - self.first
-        return self.W[skipped:, skipped:]
+        return TailRoot(first, gaussian.root_from(first))
 
     def columns(self, numbers: NDArray[np.intp]) -> FloatArray:
         """Columns (m, k) of it, by their numbers in the Gaussian."""
         return np.asarray(self.W.T.take(numbers - self.first, axis=0).T)  # contiguous ones
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class GatedRows:
+    """What the gate knows of the observations of a step, m variables.
+
+    Attributes:
+        root: of the covariance of all variables that they depend on.
+        columns: (N, 9 + C) of observations of features of the state.
+        poses: (6 F + C,) columns of poses and calibration of new features.
+        rows: (N, 2, m) derivatives of the former by whitened variables.
+        pose_root: (q, 6 F + C) the last rows of the root in the columns of poses; those before are
+            zero.
+    """
+
+    root: TailRoot
+    columns: NDArray[np.intp]
+    poses: NDArray[np.intp]
+    rows: FloatArray
+    pose_root: FloatArray
+
+    @staticmethod
+    def of(
+        gaussian: SquareRootInformation,
+        columns: NDArray[np.intp],
+        poses: NDArray[np.intp],
+        H: FloatArray,
+    ) -> GatedRows:
+        """Those of observations with derivatives H (N, 2, 9 + C)."""
+        size = gaussian.layout.size
+        first = min(int(part.min(initial=size)) for part in (columns, poses))
+        root = TailRoot.of(gaussian, first)
+        rows = np.empty((len(H), 2, len(root.W)))
+        observation_rows(H, root.W, columns - first, rows.reshape(-1, len(root.W)))
+        zeros = int(poses.min(initial=size)) - first
+        return GatedRows(root, columns, poses, rows, root.columns(poses)[zeros:])
+
+
 class WhitenedUpdate:
     """The Gaussian after an update by rows.
+
+    Attributes:
+        mean: (m,) of the whitened variables.
 
     Args:
         gaussian: before it, n variables.
@@ -72,18 +106,30 @@ class WhitenedUpdate:
         self._L, info = lapack.dpotrf(S, lower=1, overwrite_a=1)
         d = gaussian.d[root.first :]
         z, _ = lapack.dpotrs(self._L, b - Y @ d, lower=1)
-        self._x = d + Y.T @ z
-        if info != 0 or not np.isfinite(self._x).all():
+        self.mean = d + Y.T @ z
+        if info != 0 or not np.isfinite(self.mean).all():
             raise np.linalg.LinAlgError("an update is not finite")
 
     def solution(self) -> FloatArray:
         """The δ (n,) of least cost; zero before the first column of the root."""
         solution = np.zeros(self._size)
-        solution[self._root.first :] = self._root.W.T @ self._x
+        solution[self._root.first :] = self._root.W.T @ self.mean
         return solution
 
-    def covariance(self, columns: NDArray[np.intp]) -> FloatArray:
-        """The covariance (k, k) of some columns."""
-        W = self._root.columns(columns)
-        less, _ = lapack.dtrtrs(self._L, np.asfortranarray(self._Y @ W), lower=1, overwrite_b=1)
+    def less(self, rows: FloatArray) -> FloatArray:
+        """Rows Z (n, k) by which the covariance of n rows (n, m) of whitened variables is less.
+
+        It was I for the variables, and is Y Yᵀ - Z Zᵀ for the rows Y.
+        """
+        less, _ = lapack.dtrtrs(self._L, self._Y @ rows.T, lower=1)
+        return np.asarray(less.T)
+
+    def covariance(self, W: FloatArray) -> FloatArray:
+        """The covariance (k, k) of variables.
+
+        Args:
+            W: (q, k) the last rows of their columns of the root; those before are zero.
+        """
+        right = np.asfortranarray(self._Y[:, self._Y.shape[1] - len(W) :] @ W)
+        less, _ = lapack.dtrtrs(self._L, right, lower=1, overwrite_b=1)
         return np.asarray(W.T @ W - less.T @ less)

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from scipy.linalg import blas, lapack
 
 from slam_graph.arrays import FloatArray
-from slam_graph.backend.solve.triangles import lower_part, solved, transposed_inverse, upper_part
+from slam_graph.backend.solve.triangles import solved, transposed_inverse, upper_part
 from slam_graph.kernels.elimination import eliminate_columns, zeros_to_the_left
 
 _BLOCK_SIZE = 16
@@ -266,7 +266,7 @@ class SquareRootInformation:
         w = count * b
         if w == 0:
             return self
-        inverse = lower_part(transposed_inverse(self.R[:w, :w]))  # R₁₁⁻ᵀ
+        inverse = transposed_inverse(self.R[:w, :w])  # R₁₁⁻ᵀ
         covariance = blas.dsyrk(1.0, inverse, trans=1, lower=1)
         blocks = np.arange(w).reshape(count, b)
         covariance[blocks[:, :, None], blocks[:, None, :]] += noise
@@ -320,7 +320,7 @@ class SquareRootInformation:
 
     def root_covariance(self) -> FloatArray:
         """The (n, n) upper triangular R⁻¹, a root of the covariance."""
-        return np.asarray(np.tril(transposed_inverse(self.R)).T, dtype=np.float64)
+        return transposed_inverse(self.R).T
 
     def marginal(self, keep: Sequence[int]) -> SquareRootInformation:
         """The Gaussian over the variables `keep`, in that order, with all others eliminated."""

@@ -34,8 +34,7 @@ def transposed_inverse(R: FloatArray) -> FloatArray:
     """R⁻ᵀ of an upper triangular (n, n) matrix; what is below its diagonal may be anything.
 
     By the inverses of its halves and triangular products of these, which take half of the time of
-    LAPACK's `dtrtri` for a few hundred columns. What is above the diagonal of the result is zero
-    but for small matrices.
+    LAPACK's `dtrtri` for a few hundred columns. What is above the diagonal of the result is zero.
 
     Raises:
         numpy.linalg.LinAlgError: if it is singular.
@@ -45,7 +44,7 @@ def transposed_inverse(R: FloatArray) -> FloatArray:
         small, info = lapack.dtrtri(R.T, lower=1)
         if info != 0:
             raise np.linalg.LinAlgError("the information is singular")
-        return np.asarray(small, dtype=np.float64)
+        return lower_part(small)
     half = n // 2
     inverse = np.empty((n, n), order="F")
     inverse[:half, half:] = 0.0
