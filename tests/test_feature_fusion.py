@@ -18,6 +18,7 @@ from slam_graph.backend.cost.reprojection import Geometry, RigProjection
 from slam_graph.backend.smoothing import final_adjustment
 from slam_graph.backend.smoothing.final_adjustment import adjust_recording
 from slam_graph.backend.smoothing.frame_log import FrameLog
+from slam_graph.backend.smoothing.keyframe_states import states_at
 from slam_graph.backend.smoothing.projected_matches import (
     Scene,
     consistent_matches,
@@ -26,7 +27,12 @@ from slam_graph.backend.smoothing.projected_matches import (
 )
 from slam_graph.backend.smoothing.recording_segment import read_segment, triangulated
 from slam_graph.backend.smoothing.smoothing_config import FinalBaConfig
-from slam_graph.backend.smoothing.track_fusion import fused_labels, relabelled
+from slam_graph.backend.smoothing.smoothing_task import SegmentStart, SmoothingTask
+from slam_graph.backend.smoothing.track_fusion import (
+    fused_labels,
+    relabelled,
+    with_fused_features,
+)
 from slam_graph.datasets.sequence import Sequence
 from slam_graph.errors import EstimationError
 from slam_graph.evaluation.absolute_pose_error import ape
@@ -161,6 +167,23 @@ def test_fusion_takes_out_drift(log: FrameLog, sequence: Sequence) -> None:
 
     with_fusion, without = error_m(FinalBaConfig()), error_m(FinalBaConfig(fuse_features=False))
     assert with_fusion < 0.48 * without
+
+
+@pytest.mark.parametrize("noisier", [1.0, 20.0])
+def test_the_noise_of_the_imu_is_learned_with_the_fusion(
+    log: FrameLog, sequence: Sequence, noisier: float
+) -> None:
+    """It is found where the accelerometer's bias walks faster than calibrated, and only there."""
+    imu, truth = sequence.rig.imu, sequence.groundtruth()
+    assert truth is not None
+    quiet = replace(imu, accel_random_walk=imu.accel_random_walk / noisier)
+    task = SmoothingTask.of(replace(sequence.rig, imu=quiet), BackendConfig(), FinalBaConfig())
+    segment = read_segment(log, log.keyframes, task.rig, task.backend.zero_velocity)
+    states = states_at(truth, segment.keyframe_stamps_ns, segment.imu, task.preintegration)
+    found, _ = with_fused_features(SegmentStart(segment, states, 0), task, lambda *_: None)
+    assert found.loose is not None
+    assert (found.loose.noise.accel_walk > 2.0) == (noisier > 1.0)
+    assert found.loose.given == states
 
 
 def once(seen: FeatureObservations, stamp_ns: int) -> FeatureObservations:

@@ -271,7 +271,6 @@ def _adjusted(
             def report(step: int, passes: int) -> None:
                 progress.solving(steps + step, passes)
 
-            fused = replace(fused, given=start.states)
             solved = BundleAdjustment(fused, task, report).solve()
             _check(solved)
             figures = solved.figures

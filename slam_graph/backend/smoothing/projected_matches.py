@@ -211,11 +211,12 @@ def projected_matches(scene: Scene, reach_px: float) -> Matches:
         reach_px: largest mean offset.
     """
     seen, count = scene.seen, len(scene.seen.ids)
-    order = np.lexsort((seen.camera, seen.frame))
-    image = seen.frame * len(scene.projection.cameras) + seen.camera
-    starts = np.flatnonzero(np.diff(image[order])) + 1
     around_px = reach_px + _VIEW_SIGMAS * scene.sigma_px
-    found = [_around(scene, rows, around_px) for rows in np.split(order, starts)]
+    found = [
+        _around(scene, camera, rows, around_px)
+        for camera in range(len(scene.projection.cameras))
+        if len(rows := np.flatnonzero(seen.camera == camera))
+    ]
     viewed, other, offsets = (np.concatenate(column) for column in zip(*found, strict=True))
     pair, row = np.unique(viewed * count + other, return_inverse=True)
     hits = np.bincount(row, minlength=len(pair))
@@ -228,29 +229,61 @@ def projected_matches(scene: Scene, reach_px: float) -> Matches:
 
 
 def _around(
-    scene: Scene, rows: IntArray, around_px: float
+    scene: Scene, camera: int, rows: IntArray, around_px: float
 ) -> tuple[IntArray, IntArray, FloatArray]:
-    """Features seen in one image (rows of `seen`), others projected near them, and the offsets."""
+    """Features that a camera sees (`rows` of `seen`), others projected near them, and the offsets.
+
+    What is the same for all images is taken at once, as there are thousands of them.
+    """
+    seen = scene.seen
+    rows = rows[np.argsort(seen.frame[rows], kind="stable")]
+    starts = np.flatnonzero(np.diff(seen.frame[rows], prepend=-1))
+    others, pixels = _projected(scene, camera, rows, starts, around_px)
+    other, stops = np.concatenate(others), np.cumsum([0, *map(len, others)])
+    feature, usable = seen.feature[rows], scene.usable[seen.feature[rows]]
+    own_pixels = seen.pixels[rows[usable]]
+    begins = np.append(0, np.cumsum(usable))[np.append(starts, len(rows))]
+    pairs = []
+    for k in range(len(starts)):
+        own, projected = slice(*begins[k : k + 2]), slice(*stops[k : k + 2])
+        near = near_pairs(own_pixels[own], pixels[projected], around_px)
+        pairs.append(near + np.array([begins[k], stops[k]]))
+    near, hit = np.concatenate(pairs).T
+    return feature[usable][near], other[hit], pixels[hit] - own_pixels[near]
+
+
+def _projected(
+    scene: Scene, camera: int, rows: IntArray, starts: IntArray, around_px: float
+) -> tuple[list[IntArray], FloatArray]:
+    """Features that each image of a camera may see but does not, and the pixels of all of them.
+
+    Args:
+        scene: the features.
+        camera: its number.
+        rows: of `seen`, those of one image after those of the other.
+        starts: where those of each image begin.
+        around_px: how far from what an image sees they may be.
+    """
     seen, at, projection = scene.seen, scene.at, scene.projection
-    frame, camera = seen.frame[rows[0]], seen.camera[rows[0]]
-    world_R_camera = at.rotations[frame] @ projection.body_R_camera[camera]
-    centre = at.positions[frame] + at.rotations[frame] @ projection.body_p_camera[camera]
-    used = scene.usable.copy()
-    used[seen.feature[rows]] = False
-    lens, places = projection.cameras[camera], seen.normalized[rows]
+    lens, frames = projection.cameras[camera], seen.frame[rows[starts]]
+    R = at.rotations[frames] @ projection.body_R_camera[camera]
+    centres = at.positions[frames] + at.rotations[frames] @ projection.body_p_camera[camera]
     # a distortion model is valid as far from the axis as features are seen
-    square = float(np.max(np.sum(places**2, axis=1)))
+    places = seen.normalized[rows]
+    squares = np.maximum.reduceat(np.sum(places**2, axis=1), starts).tolist()
     wide = math.inf if lens.model.sees_sideways else _STRETCH * around_px / min(lens.fx, lens.fy)
-    bounds = np.stack([places.min(axis=0) - wide, places.max(axis=0) + wide])
-    others, normalized = np.empty(len(used), np.int64), np.empty((len(used), 2))
-    count = points_ahead(
-        at.points, used, world_R_camera, centre, _MIN_DEPTH_M, square, bounds, others, normalized
-    )
-    pixels = lens.pixels(normalized[:count])
-    rows = rows[scene.usable[seen.feature[rows]]]
-    near, hit = near_pairs(seen.pixels[rows], pixels, around_px).T
-    rows = rows[near]
-    return seen.feature[rows], others[hit], pixels[hit] - seen.pixels[rows]
+    least, most = np.minimum.reduceat(places, starts), np.maximum.reduceat(places, starts)
+    bounds = np.stack([least - wide, most + wide], axis=1)
+    used, others, normalized = scene.usable.copy(), [], []
+    numbers, ahead = np.empty(len(used), np.int64), np.empty((len(used), 2))
+    for k, own in enumerate(np.split(seen.feature[rows], starts[1:])):
+        used[own] = False
+        where = R[k], centres[k], _MIN_DEPTH_M, squares[k], bounds[k]
+        count = points_ahead(at.points, used, *where, numbers, ahead)
+        used[own] = scene.usable[own]
+        others.append(numbers[:count].copy())
+        normalized.append(ahead[:count].copy())
+    return others, lens.pixels(np.concatenate(normalized))
 
 
 def _whitened(

@@ -140,10 +140,10 @@ class RecordingFactors:
         rig: calibrated sensors, with cameras that GTSAM has (`with_gtsam_cameras`).
         backend: noise.
         config: the robust loss.
-        least_noise: smallest factor on the noise of the IMU that is learned.
+        noise: factors on the noise of the IMU beyond those that the causal run learned.
 
     Attributes:
-        noise: factors on the noise of the IMU beyond those that the causal run learned.
+        noise: as given, or as `learn_noise` has found it since.
     """
 
     def __init__(
@@ -153,11 +153,11 @@ class RecordingFactors:
         rig: Rig,
         backend: BackendConfig,
         config: FinalBaConfig,
-        least_noise: float = 1.0,
+        noise: ImuNoiseFactors,
     ) -> None:
         self._segment, self._anchor, self._rig = segment, anchor, rig
         self._backend, self._config = backend, config
-        self.noise = ImuNoiseFactors(least=least_noise)
+        self.noise = noise
         between = list(pairwise(segment.keyframe_stamps_ns.tolist()))
         samples = [segment.imu.between(*interval) for interval in between]
         self._steps = [block.short_steps() for block in samples]

@@ -100,8 +100,10 @@ class BundleAdjustment:
         self._backend, self._config = backend, config = task.backend, task.config
         self._projection = RigProjection(self._task.rig, taken_by=task.rig)
         self._report = report
+        loose = start.loose
+        noise = ImuNoiseFactors(least=task.least_noise) if loose is None else loose.noise
         self._factors = RecordingFactors(
-            segment, start.anchor, self._task.rig, backend, config, task.least_noise
+            segment, start.anchor, self._task.rig, backend, config, noise
         )
         seen = segment.seen_by_keyframes()
         chosen = longest_tracks(seen, config.features, _MIN_KEYFRAMES)
@@ -110,8 +112,8 @@ class BundleAdjustment:
         self.iterations = self._passes = 0
         self._sigma_px, self._inefficiency = backend.noise.pixel_sigma, 1.0
         self._values, self._shared = values_of(start.states), segment.aiding.shared()
-        self._given = values_of(start.given or start.states)
-        self._adjusted = start.given is not None  # to the observations of some of the keyframes
+        self._given = values_of(start.states if loose is None else loose.given)
+        self._adjusted = loose is not None
         self._factor: EliminatedStates | None = None
         self._note_motions()
 
@@ -172,7 +174,7 @@ class BundleAdjustment:
         return AdjustedSegment(states, figures, aligned, self.imu_noise, kept, fixes)
 
     def solve_loosely(self, stamps_ns: IntArray) -> list[NavState]:
-        """States near the minimum, with outliers, to a loose tolerance.
+        """States near the minimum, with outliers, to a loose tolerance; learns the IMU's noise.
 
         Args:
             stamps_ns: of the states, ascending; those of the keyframes among them.
@@ -181,6 +183,12 @@ class BundleAdjustment:
             EstimationError: if there is no minimum.
         """
         self._minimize_loosely()
+        if self._config.learn_imu_noise and self._factor is not None:
+            inertial = self._minimum.cost.inertial
+            try:
+                self._factors.learn_noise(inertial, self._values, self._factor.times_covariance)
+            except (RuntimeError, np.linalg.LinAlgError) as error:
+                logger.info("the noise of the IMU is not learned loosely: %s", error)
         return self._states(stamps_ns)
 
     # --- features --------------------------------------------------------------------------------

@@ -191,9 +191,12 @@ def _recalibrated(points: FloatArray, cameras: IntArray, log: FrameLog, rig: Rig
 def _table(
     ids: IntArray, frames: IntArray, cameras: IntArray, points: FloatArray, count: int
 ) -> Observations:
-    """The finite observations in `count` frames, sorted by feature, frame and camera."""
+    """The finite observations in `count` frames, sorted by feature, frame and camera.
+
+    They are given by frame and camera.
+    """
     finite = np.flatnonzero(np.isfinite(points).all(axis=1))
-    order = finite[np.lexsort((cameras[finite], frames[finite], ids[finite]))]
+    order = finite[np.argsort(ids[finite], kind="stable")]
     features, feature = np.unique(ids[order], return_inverse=True)
     points = points[order]
     return Observations(

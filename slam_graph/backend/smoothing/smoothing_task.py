@@ -60,6 +60,19 @@ class SmoothingTask:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class LooseAdjustment:
+    """What an adjustment to the observations of some of the keyframes has left.
+
+    Attributes:
+        given: states of the keyframes before it, for `cost_before`.
+        noise: factors on the noise of the IMU that it has learned.
+    """
+
+    given: list[NavState]
+    noise: ImuNoiseFactors
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class SegmentStart:
     """A segment of a recording, and where its bundle adjustment starts.
 
@@ -67,14 +80,13 @@ class SegmentStart:
         segment: times, observations, IMU samples.
         states: initial states of the keyframes.
         anchor: number of the keyframe whose position and yaw are fixed.
-        given: states of the keyframes before any adjustment, for `cost_before`, where `states` are
-            adjusted to the observations of some of them; None where they are not.
+        loose: the adjustment that `states` come from; None if they are not adjusted yet.
     """
 
     segment: RecordingSegment
     states: list[NavState]
     anchor: int
-    given: list[NavState] | None = None
+    loose: LooseAdjustment | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -11,7 +11,8 @@ in the same frame are different points.
 
 Fusion alternates with a loose bundle adjustment of every second keyframe: fused features reduce the
 drift of the poses, and with better poses more features are found to be the same. Each round starts
-from the original tracks, so that a false fusion can be corrected.
+from the original tracks, so that a false fusion can be corrected, and from the noise of the IMU
+that the one before has shown.
 """
 
 from __future__ import annotations
@@ -41,7 +42,11 @@ from slam_graph.backend.smoothing.recording_segment import (
     views,
     with_gtsam_cameras,
 )
-from slam_graph.backend.smoothing.smoothing_task import SegmentStart, SmoothingTask
+from slam_graph.backend.smoothing.smoothing_task import (
+    LooseAdjustment,
+    SegmentStart,
+    SmoothingTask,
+)
 from slam_graph.geometry import NavState
 from slam_graph.sensors import Rig
 
@@ -71,8 +76,8 @@ def with_fused_features(
         report: is given after each step: steps so far, rounds that are complete.
 
     Returns:
-        The segment with fused features and the states of its keyframes after the last loose bundle
-        adjustment, and the number of steps of all of them.
+        The segment with fused features after the last loose bundle adjustment, and the number of
+        steps of all of them.
 
     Raises:
         EstimationError: if there is no minimum.
@@ -82,19 +87,22 @@ def with_fused_features(
     fixed = int(np.searchsorted(chosen, anchor))
     steps = rounds = 0
 
-    def adjusted(segment: RecordingSegment, states: list[NavState]) -> list[NavState]:
+    def adjusted(
+        segment: RecordingSegment, states: list[NavState], loose: LooseAdjustment | None = None
+    ) -> tuple[list[NavState], LooseAdjustment]:
         nonlocal steps, rounds
         before = steps
         keyframes = segment.keyframes[chosen]
         aiding = segment.aiding.at(segment.stamps_ns[keyframes])
         thin = replace(segment, keyframes=keyframes, aiding=aiding)
-        start = SegmentStart(thin, [states[k] for k in chosen], fixed)
+        start = SegmentStart(thin, [states[k] for k in chosen], fixed, loose)
         problem = BundleAdjustment(start, task, lambda n, _: report(before + n, rounds))
         states = problem.solve_loosely(segment.keyframe_stamps_ns)
         steps, rounds = steps + problem.iterations, rounds + 1
-        return states
+        return states, LooseAdjustment([given.states[k] for k in chosen], problem.imu_noise)
 
-    states, own = adjusted(segment, states), np.arange(len(segment.seen.ids))
+    states, loose = adjusted(segment, states)
+    own = np.arange(len(segment.seen.ids))
     tried = [own]
     for _ in range(_MAX_ROUNDS):
         label = _labels(segment, states, task.rig, task.backend)
@@ -104,8 +112,9 @@ def with_fused_features(
         if least <= _SETTLED * np.sum(label != own):
             break
         tried.append(label)
-        states = adjusted(_relabelled(segment, label), states)
-    return SegmentStart(_relabelled(segment, label), states, anchor), steps
+        states, loose = adjusted(_relabelled(segment, label), states, loose)
+    loose = LooseAdjustment(given.states, loose.noise)
+    return SegmentStart(_relabelled(segment, label), states, anchor, loose), steps
 
 
 def _relabelled(segment: RecordingSegment, label: IntArray) -> RecordingSegment:
@@ -161,7 +170,10 @@ def relabelled(seen: Observations, label: IntArray) -> Observations:
     """
     kept = np.unique(label)
     feature = np.searchsorted(kept, label)[seen.feature]
-    order = np.lexsort((seen.camera, seen.frame, feature))
+    image = seen.frame * (int(seen.camera.max(initial=0)) + 1) + seen.camera
+    count = int(image.max(initial=0)) + 1
+    # most are in order already, which a stable sort of one key makes use of
+    order = np.argsort(feature * count + image, kind="stable")
     return Observations(
         seen.ids[kept],
         seen.frames,
