@@ -122,7 +122,7 @@ class Registry(Mapping[str, PartT], Generic[PartT]):
 
     def __iter__(self) -> Iterator[str]:
         own = dict.fromkeys([*self._names, *(self._parts if self._names else self._own())])
-        yield from own  # plugins are looked for when they are reached
+        yield from own  # entry points are read only if the caller goes on past these names
         yield from [name for name in self._offered() if name not in own]
 
     def __len__(self) -> int:
@@ -208,6 +208,7 @@ class Registry(Mapping[str, PartT], Generic[PartT]):
 def _all_entry_points(path: tuple[str, ...]) -> Any:
     """What all packages on the path offer: a search looks at every one, whatever the group.
 
+    The path is the key of the cache: packages that are installed into it later are not seen.
     Its class depends on the version of Python; `select` finds those of a group in any.
     """
     return entry_points()

@@ -11,7 +11,7 @@ from gtsam.symbol_shorthand import B, V, X
 
 from slam_graph.arrays import FloatArray
 from slam_graph.backend.cost.imu_factor import imu_factor
-from slam_graph.backend.smoothing.imu_noise_estimation import variance_ratios
+from slam_graph.backend.smoothing.imu_noise_estimation import ImuNoiseFactors, variance_ratios
 from slam_graph.backend.solve.square_root import Layout
 from slam_graph.backend.solve.state import dims_of
 from slam_graph.sensors import ImuNoise
@@ -112,6 +112,16 @@ def test_rounds_find_a_noise_that_is_not_as_assumed(seed: int) -> None:
     _, sigmas = exact(imu_factors(factors), values, layout, P)
     assert np.all(away[2] < 0.6 * away[0])  # as many rounds as an adjustment takes
     assert np.all(away[4] < 4.0 * 0.5 * sigmas)  # 3 of the data, 1 of the random signs
+
+
+def test_rounds_come_back_from_a_bound_at_once() -> None:
+    """However many rounds have found less noise than is calibrated."""
+    noise = ImuNoiseFactors()
+    for _ in range(10):
+        noise = noise.times(np.array([0.2, 0.2, 1.0, 1.0])).bounded(2.0, 1.0)
+    assert noise.white(2.0, 1.0) == (1.0, 1.0)
+    again = noise.times(np.array([4.0, 9.0, 1.0, 1.0])).bounded(2.0, 1.0)
+    assert np.allclose(again.white(2.0, 1.0), (2.0, 3.0))
 
 
 def scaled(factors: FloatArray) -> ImuNoise:

@@ -49,6 +49,12 @@ def test_distances_by_rows_are_those_by_the_covariance() -> None:
     ):
         P = gaussian.covariance()[columns[:, :, None], columns[:, None, :]]
         np.testing.assert_allclose(found, squared_mahalanobis(r, H, P), rtol=1e-9)
+    root = known.pose_root  # without the rows that are zero
+    assert len(root) < len(known.root.W)
+    np.testing.assert_allclose(root.T @ root, before.covariance()[70:, 70:], rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(
+        update.covariance(root), after.covariance()[70:, 70:], rtol=1e-9, atol=1e-12
+    )
 
 
 @pytest.mark.parametrize("where", ["rows", "right-hand side", "Gaussian"])

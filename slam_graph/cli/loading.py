@@ -14,9 +14,9 @@ from typing import Any
 
 from slam_graph.interrupts import Interrupts
 
-_UNUSED = ("f2py", "ma", "polynomial", "testing")
-"""Parts of NumPy that SciPy imports because it copies all names of NumPy; hardly anybody uses them,
-and they take longer than half of `scipy.linalg`."""
+_POSTPONED = ("f2py", "ma", "polynomial", "testing")
+"""Parts of NumPy that SciPy imports because it copies all names of NumPy. A run hardly ever uses
+them, and they take some 100 ms."""
 
 
 @contextmanager
@@ -37,7 +37,7 @@ def loading(text: str = "loading") -> Iterator[None]:
             Interrupts.completed() as begin
         ):  # Ctrl-C in the middle of an import is not always heard
             begin()
-            _postpone_unused()
+            _postpone_parts()
             yield
     finally:
         gc.freeze()
@@ -64,15 +64,15 @@ class _Postponed(ModuleType):
         return getattr(self, name)
 
 
-def _postpone_unused() -> None:
+def _postpone_parts() -> None:
     """Import the unused parts of NumPy when the first of their names is used."""
     import numpy as np
 
-    for part in _UNUSED:
+    for part in _POSTPONED:
         name = f"numpy.{part}"
         spec = None if name in sys.modules else find_spec(name)
         if spec is not None:
             module = sys.modules[name] = module_from_spec(spec)
-            del module.__path__  # who imports a module of the package asks for it
+            del module.__path__  # `import numpy.ma.core` asks for it, which executes the package
             module.__class__ = _Postponed
             setattr(np, part, module)

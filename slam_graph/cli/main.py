@@ -44,7 +44,7 @@ from slam_graph.version import __version__
 # The matrices of a window are a few hundred wide. BLAS threads make these slower, up to ten times
 # where other work shares the cores. OpenBLAS reads this when NumPy is first imported.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-# Nothing here is for plugins of pydantic, and it would look at all installed packages for some.
+# Settings need no plugins of pydantic, which it would look for in all installed packages.
 os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
 
 config_app = typer.Typer(

@@ -197,19 +197,14 @@ class Verdict(Stage):
         self._refuse(waited, rig, _ruins if self._result.segments.lasted else _hinders)
 
     def _watch_early(self) -> None:
-        """Look once whether the estimate is worth anything, when half of what is looked at is there.
+        """Look once whether the estimate is worth anything, half-way to all that is looked at.
 
         Raises:
             DataError: if what the run was given is certainly wrong, and by so much.
         """
-        if self._looked_early or not self._refuses:
-            return
-        self._looked_early = True
-        found = None
-        with warn_on_failure(self._diagnostics, "diagnosis_failed", "the cause is not looked for"):
-            found = self._nearby(self._final_rig())
-        if found is not None and found.setup_faults:
-            self._refuse("the estimate is wrong", self._final_rig(), _ruins)
+        if self._refuses and not self._looked_early:
+            self._looked_early = True
+            self._refuse_if_ruined(self._quick_look())
 
     def _watch_full(self) -> None:
         """Look once whether the estimate is worth anything, when all that is looked at is there.
@@ -219,10 +214,20 @@ class Verdict(Stage):
         """
         if self._looked is not None or self._look_failed:
             return
-        self._look_failed = True
+        self._looked = self._quick_look()
+        self._look_failed = self._looked is None
+        if self._refuses:
+            self._refuse_if_ruined(self._looked)
+
+    def _quick_look(self) -> Diagnosis | None:
+        """A quick look at what was recorded so far; None if it failed."""
         with warn_on_failure(self._diagnostics, "diagnosis_failed", "the cause is not looked for"):
-            self._looked, self._look_failed = self._nearby(self._final_rig()), False
-        if self._refuses and self._looked is not None and self._looked.setup_faults:
+            return self._nearby(self._final_rig())
+        return None
+
+    def _refuse_if_ruined(self, look: Diagnosis | None) -> None:
+        """Raise DataError if a quick look shows a fault that makes the estimate worth nothing."""
+        if look is not None and look.setup_faults:
             self._refuse("the estimate is wrong", self._final_rig(), _ruins)
 
     def _refuse(self, why: str, rig: Rig, matters: _Matters) -> None:

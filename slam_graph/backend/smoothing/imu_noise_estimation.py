@@ -88,6 +88,16 @@ class ImuNoiseFactors:
         found = np.clip([self.gyro * gyro, self.accel * accel], self.least, MAX_FACTOR)
         return float(found[0]), float(found[1])
 
+    def bounded(self, gyro: float, accel: float) -> ImuNoiseFactors:
+        """Those that `white` uses, so that many rounds do not lead far beyond its bounds.
+
+        Args:
+            gyro: factor on white noise of the gyroscope from the causal run.
+            accel: the same of the accelerometer.
+        """
+        of_gyro, of_accel = self.white(gyro, accel)
+        return replace(self, gyro=of_gyro / gyro, accel=of_accel / accel)
+
     def near(self, other: ImuNoiseFactors, learned: list[float]) -> bool:
         """Whether two sets of factors are the same but for what residuals can tell.
 

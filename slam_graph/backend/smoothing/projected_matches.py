@@ -147,6 +147,8 @@ _CORRELATED = 0.25
 """Least variance of a mean offset relative to that of one view: errors of tracks are correlated."""
 _MAX_PROJECTION_SIGMAS = 1.5
 """Projections of larger uncertainty are not used, in σ of the observations."""
+_IMAGES = 64
+"""So many images of a camera are taken at once: more of them take memory, and no less time."""
 _MIN_DEPTH_M = 0.1
 """Points nearer to the camera are not projected."""
 _STRETCH = 4.0
@@ -212,11 +214,10 @@ def projected_matches(scene: Scene, reach_px: float) -> Matches:
     """
     seen, count = scene.seen, len(scene.seen.ids)
     around_px = reach_px + _VIEW_SIGMAS * scene.sigma_px
-    found = [
-        _around(scene, camera, rows, around_px)
-        for camera in range(len(scene.projection.cameras))
-        if len(rows := np.flatnonzero(seen.camera == camera))
-    ]
+    block = seen.frame // _IMAGES * len(scene.projection.cameras) + seen.camera
+    order = np.lexsort((seen.frame, block))
+    starts = np.flatnonzero(np.diff(block[order])) + 1
+    found = [_around(scene, rows, around_px) for rows in np.split(order, starts)]
     viewed, other, offsets = (np.concatenate(column) for column in zip(*found, strict=True))
     pair, row = np.unique(viewed * count + other, return_inverse=True)
     hits = np.bincount(row, minlength=len(pair))
@@ -229,16 +230,18 @@ def projected_matches(scene: Scene, reach_px: float) -> Matches:
 
 
 def _around(
-    scene: Scene, camera: int, rows: IntArray, around_px: float
+    scene: Scene, rows: IntArray, around_px: float
 ) -> tuple[IntArray, IntArray, FloatArray]:
-    """Features that a camera sees (`rows` of `seen`), others projected near them, and the offsets.
+    """Features in some images of a camera, others projected near them, and the offsets.
 
-    What is the same for all images is taken at once, as there are thousands of them.
+    Args:
+        scene: the features.
+        rows: of `seen`, all of one camera, sorted by frame.
+        around_px: how near.
     """
     seen = scene.seen
-    rows = rows[np.argsort(seen.frame[rows], kind="stable")]
     starts = np.flatnonzero(np.diff(seen.frame[rows], prepend=-1))
-    others, pixels = _projected(scene, camera, rows, starts, around_px)
+    others, pixels = _projected(scene, rows, starts, around_px)
     other, stops = np.concatenate(others), np.cumsum([0, *map(len, others)])
     feature, usable = seen.feature[rows], scene.usable[seen.feature[rows]]
     own_pixels = seen.pixels[rows[usable]]
@@ -253,19 +256,19 @@ def _around(
 
 
 def _projected(
-    scene: Scene, camera: int, rows: IntArray, starts: IntArray, around_px: float
+    scene: Scene, rows: IntArray, starts: IntArray, around_px: float
 ) -> tuple[list[IntArray], FloatArray]:
     """Features that each image of a camera may see but does not, and the pixels of all of them.
 
     Args:
         scene: the features.
-        camera: its number.
-        rows: of `seen`, those of one image after those of the other.
+        rows: of `seen`, all of one camera, sorted by frame.
         starts: where those of each image begin.
         around_px: how far from what an image sees they may be.
     """
     seen, at, projection = scene.seen, scene.at, scene.projection
-    lens, frames = projection.cameras[camera], seen.frame[rows[starts]]
+    camera, frames = seen.camera[rows[0]], seen.frame[rows[starts]]
+    lens = projection.cameras[camera]
     R = at.rotations[frames] @ projection.body_R_camera[camera]
     centres = at.positions[frames] + at.rotations[frames] @ projection.body_p_camera[camera]
     # a distortion model is valid as far from the axis as features are seen

@@ -257,8 +257,8 @@ class RecordingFactors:
         keyframes = len(self._segment.keyframes)
         chosen = [factors[k] for k in moving]
         ratios = variance_ratios(chosen, values, keyframes, times_covariance)
-        noise = self.noise.times(ratios)
         learned = np.sqrt(np.mean(self._segment.noise**2, axis=0)).tolist()
+        noise = self.noise.times(ratios).bounded(*learned)
         if noise.near(self.noise, learned):
             return False
         self.noise = noise

@@ -174,7 +174,10 @@ class BundleAdjustment:
         return AdjustedSegment(states, figures, aligned, self.imu_noise, kept, fixes)
 
     def solve_loosely(self, stamps_ns: IntArray) -> list[NavState]:
-        """States near the minimum, with outliers, to a loose tolerance; learns the IMU's noise.
+        """States near the minimum, with outliers, to a loose tolerance.
+
+        Under `learn_imu_noise` the noise of the IMU is learned there, too, and is in `imu_noise`.
+        It stays as it was where the last step left no factor, or the estimate fails.
 
         Args:
             stamps_ns: of the states, ascending; those of the keyframes among them.

@@ -193,7 +193,7 @@ def _table(
 ) -> Observations:
     """The finite observations in `count` frames, sorted by feature, frame and camera.
 
-    They are given by frame and camera.
+    Rows must be sorted by frame and camera already.
     """
     finite = np.flatnonzero(np.isfinite(points).all(axis=1))
     order = finite[np.argsort(ids[finite], kind="stable")]

@@ -76,8 +76,8 @@ def with_fused_features(
         report: is given after each step: steps so far, rounds that are complete.
 
     Returns:
-        The segment with fused features after the last loose bundle adjustment, and the number of
-        steps of all of them.
+        The segment with fused features, with the states of its keyframes and the noise of the IMU
+        after the last loose bundle adjustment; and the number of steps of all of them.
 
     Raises:
         EstimationError: if there is no minimum.
