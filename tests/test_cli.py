@@ -12,7 +12,7 @@ from commands import slam_graph
 from limits import HANG_S
 from typer.testing import CliRunner
 
-from slam_graph.cli.main import app
+from slam_graph.cli.main import _with_one_command, app
 from slam_graph.version import __version__
 
 SLOW_IMPORTS = ("numpy", "gtsam", "cv2", "rerun", "matplotlib", "scipy", "yaml")
@@ -78,6 +78,13 @@ assert set(dir(slam_graph)) == set(slam_graph.__all__)
 def test_little_is_imported_before_signals_are_minded() -> None:
     script = "import sys, slam_graph.cli.launch; assert 'typing' not in sys.modules"
     subprocess.run([sys.executable, "-c", script], check=True, timeout=HANG_S)
+
+
+def test_options_are_made_for_the_command_that_is_asked_for() -> None:
+    alone = _with_one_command("run")
+    assert [command.name for command in alone.registered_commands] == ["run"]
+    assert not alone.registered_groups
+    assert all(_with_one_command(*first) is app for first in ([], ["--version"], ["rnu"]))
 
 
 def test_version() -> None:

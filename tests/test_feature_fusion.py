@@ -186,6 +186,19 @@ def test_the_noise_of_the_imu_is_learned_with_the_fusion(
     assert found.loose.given == states
 
 
+def test_fused_observations_are_sorted_by_feature_frame_and_camera(log: FrameLog) -> None:
+    task = SmoothingTask.of(log.rig, BackendConfig(), FinalBaConfig())
+    seen = read_segment(log, log.keyframes, task.rig, task.backend.zero_velocity).seen
+    label = np.arange(len(seen.ids))
+    label[1::2] = label[::2][: len(label[1::2])] // 3  # every second one, with one far before it
+    for table in (seen, relabelled(seen, label)):
+        order = np.lexsort((table.camera, table.frame, table.feature))
+        assert np.array_equal(table.feature, table.feature[order])
+        assert np.array_equal(table.frame, table.frame[order])
+        assert np.array_equal(table.camera, table.camera[order])
+    assert len(relabelled(seen, label)) == len(seen)
+
+
 def once(seen: FeatureObservations, stamp_ns: int) -> FeatureObservations:
     """Features that nothing else saw."""
     return replace(seen, ids=stamp_ns + np.arange(len(seen)))

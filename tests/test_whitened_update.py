@@ -41,11 +41,11 @@ def test_distances_by_rows_are_those_by_the_covariance() -> None:
     A[:, :, -1] = r
     of_some = known.rows[:5].reshape(10, -1)
     update = WhitenedUpdate(before, known.root, of_some, r[:5].ravel())
-    less = update.less(known.rows.reshape(24, -1)).reshape(12, 2, -1)
+    reduction = update.reduction(known.rows.reshape(24, -1)).reshape(12, 2, -1)
     after = before.updated(A[:5].reshape(10, -1))
     for gaussian, found in (
         (before, distances_of_rows(r, known.rows)),
-        (after, distances_of_rows(r, known.rows, less)),
+        (after, distances_of_rows(r, known.rows, reduction)),
     ):
         P = gaussian.covariance()[columns[:, :, None], columns[:, None, :]]
         np.testing.assert_allclose(found, squared_mahalanobis(r, H, P), rtol=1e-9)

@@ -194,7 +194,7 @@ def motionless_samples(after_ns: int | None, until_ns: int) -> ImuData:
     steps = np.array([until_ns])
     if after_ns is not None:
         steps = after_ns + (until_ns - after_ns) * np.arange(1, _STEPS + 1) // _STEPS
-        if until_ns - after_ns < _STEPS:  # nanoseconds: some are the same
+        if until_ns - after_ns < _STEPS:  # fewer nanoseconds than steps
             steps = np.unique(steps[steps > after_ns])
     none = np.zeros((len(steps), 3))
     return ImuData(steps, none, none)

@@ -28,7 +28,7 @@ from slam_graph.arrays import BoolArray, FloatArray, IntArray
 from slam_graph.backend.backend_config import TriangulationConfig
 from slam_graph.backend.cost.feature_tracks import is_in
 from slam_graph.backend.cost.reprojection import RigProjection
-from slam_graph.backend.cost.triangulation import seen_twice, triangulate
+from slam_graph.backend.cost.triangulation import seen_by_first_and_another, triangulate
 from slam_graph.geometry import NavState
 from slam_graph.sensors import FeatureFrame, Rig, RigCamera
 
@@ -254,7 +254,7 @@ def depths_within(
         rig: its cameras.
         rate: (3,) angular rate of the body, rad/s, by which rows of a rolling shutter differ; None
             for none.
-        wanted: features (N,) of the first camera; None for all that it sees.
+        wanted: features (N,), all of which the first camera sees; None for all that it sees.
         projection: into the cameras, if there is one already.
 
     Returns:
@@ -264,7 +264,7 @@ def depths_within(
     ids = np.sort(frame.cameras[0].ids if wanted is None else wanted)
     if len(rig.cameras) < 2 or len(ids) == 0:
         return _no_points()
-    obs = seen_twice(ids, frame)
+    obs = seen_by_first_and_another(ids, frame)
     if len(obs) == 0:
         return _no_points()
     projection = projection or RigProjection(rig)
@@ -284,6 +284,7 @@ def depths_within(
 
 
 def _no_points() -> KnownPoints:
+    """No feature."""
     return KnownPoints(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros(0, np.bool_))
 
 

@@ -110,8 +110,9 @@ def _landmarks_pass(linear: Linearization, update: WhitenedUpdate, known: GatedR
     large = (~passed).nonzero()[0]
     if len(large):
         of_large = known.rows.take(large, axis=0)
-        less = update.less(of_large.reshape(-1, rows.shape[1])).reshape(len(large), 2, -1)
-        passed[large] = distances_of_rows(r[large], of_large, less) < limit
+        reduction = update.reduction(of_large.reshape(-1, rows.shape[1]))
+        reduction = reduction.reshape(len(large), 2, -1)
+        passed[large] = distances_of_rows(r[large], of_large, reduction) < limit
     return passed
 
 

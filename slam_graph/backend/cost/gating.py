@@ -131,19 +131,23 @@ def distances_of_observations(
 
 
 def distances_of_rows(
-    r: FloatArray, rows: FloatArray, less: FloatArray | None = None
+    r: FloatArray, rows: FloatArray, reduction: FloatArray | None = None
 ) -> FloatArray:
     """Squared Mahalanobis distances (N,) of observations, from their rows by whitened variables.
 
     Args:
         r: (N, 2) residuals.
         rows: (N, 2, m) their derivatives Y by variables whose covariance is the identity.
-        less: (N, 2, k) rows Z where an update has made the covariance of Y x less, by Z Zᵀ.
+        reduction: (N, 2, k) rows Z; an update has reduced the covariance Y Yᵀ of the rows by Z Zᵀ.
+            None for no update.
 
     Returns:
         rᵀ (Y Yᵀ - Z Zᵀ + I)⁻¹ r.
     """
-    s00, s01, s11 = _products(rows) if less is None else _products(rows) - _products(less)
+    products = _products(rows)
+    if reduction is not None:
+        products -= _products(reduction)
+    s00, s01, s11 = products
     s00, s11 = s00 + 1.0, s11 + 1.0
     u, v = r.T
     squares = s11 * u * u - 2.0 * s01 * u * v + s00 * v * v

@@ -143,11 +143,15 @@ def triangulate_frames(
     return Triangulation(points[place], good[place], reprojection_px[place], depth_error[place])
 
 
-def seen_twice(ids: IntArray, frame: FeatureFrame) -> Observations:
-    """Observations in one frame of those of some features (ascending ids) that two cameras see.
+def seen_by_first_and_another(ids: IntArray, frame: FeatureFrame) -> Observations:
+    """Observations in one frame of features that the first camera sees, and another one as well.
 
-    They are those of the first camera, which must see all of the features, and of one or more
-    others; of each feature the first camera's come first.
+    Args:
+        ids: ascending; the first camera sees all of them.
+        frame: the frame.
+
+    Returns:
+        Sorted by feature, and by camera.
     """
     cameras = frame.cameras
     others = np.concatenate([np.zeros(0, np.int64), *(seen.ids for seen in cameras[1:])])

@@ -116,13 +116,14 @@ class WhitenedUpdate:
         solution[self._root.first :] = self._root.W.T @ self.mean
         return solution
 
-    def less(self, rows: FloatArray) -> FloatArray:
-        """Rows Z (n, k) by which the covariance of n rows (n, m) of whitened variables is less.
+    def reduction(self, rows: FloatArray) -> FloatArray:
+        """By what the update has reduced the covariance of rows A (n, m) of whitened variables.
 
-        It was I for the variables, and is Y Yᵀ - Z Zᵀ for the rows Y.
+        Returns:
+            Z (n, k): the covariance was A Aᵀ before it, and is A Aᵀ - Z Zᵀ after it.
         """
-        less, _ = lapack.dtrtrs(self._L, self._Y @ rows.T, lower=1)
-        return np.asarray(less.T)
+        Z_transposed, _ = lapack.dtrtrs(self._L, self._Y @ rows.T, lower=1)
+        return np.asarray(Z_transposed.T)
 
     def covariance(self, W: FloatArray) -> FloatArray:
         """The covariance (k, k) of variables.
@@ -131,5 +132,5 @@ class WhitenedUpdate:
             W: (q, k) the last rows of their columns of the root; those before are zero.
         """
         right = np.asfortranarray(self._Y[:, self._Y.shape[1] - len(W) :] @ W)
-        less, _ = lapack.dtrtrs(self._L, right, lower=1, overwrite_b=1)
-        return np.asarray(W.T @ W - less.T @ less)
+        Z_transposed, _ = lapack.dtrtrs(self._L, right, lower=1, overwrite_b=1)
+        return np.asarray(W.T @ W - Z_transposed.T @ Z_transposed)
