@@ -22,7 +22,7 @@ def test_mean_and_covariance_are_those_of_an_update_by_qr() -> None:
     columns = np.array([95, 31, 60])
     expected = after.covariance()[np.ix_(columns, columns)]
     np.testing.assert_allclose(
-        update.covariance(root.columns(columns)), expected, rtol=1e-9, atol=1e-12
+        update.covariance(root.last_rows(columns)), expected, rtol=1e-9, atol=1e-12
     )
     np.testing.assert_allclose(update.solution()[first:], after.solution()[first:], atol=1e-12)
     np.testing.assert_allclose(root.W.T @ update.mean, after.solution()[first:], atol=1e-12)
@@ -34,7 +34,7 @@ def test_distances_by_rows_are_those_by_the_covariance() -> None:
     before = SquareRootInformation(Layout(dict.fromkeys(range(8), 10)), Rd)
     columns = np.array([rng.choice(np.arange(20, 80), 9, replace=False) for _ in range(12)])
     H, r = rng.normal(size=(12, 2, 9)), rng.normal(size=(12, 2))
-    known = GatedRows.of(before, columns, np.arange(70, 80), H)
+    known = GatedRows.with_rows(before, columns, np.arange(70, 80), H)
     assert known.root.first == columns.min()
     A = np.zeros((12, 2, 81))
     A[np.arange(12)[:, None], :, columns] = H.transpose(0, 2, 1)

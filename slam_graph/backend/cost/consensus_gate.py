@@ -92,7 +92,7 @@ def _gated_rows(cost: Cost, linear: Linearization, predicted: SquareRootInformat
     tracks = None if linear.tracks is None or cost.tracks is None else cost.tracks.obs
     columns, poses = gated_columns(landmarks, tracks, cost.rig, predicted.layout)
     H = np.zeros((0, 2, 9)) if linear.landmarks is None else linear.landmarks.H
-    return GatedRows.of(predicted, columns, poses, H)
+    return GatedRows.with_rows(predicted, columns, poses, H)
 
 
 def _landmarks_pass(linear: Linearization, update: WhitenedUpdate, known: GatedRows) -> BoolArray:

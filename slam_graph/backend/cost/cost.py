@@ -28,10 +28,8 @@ from slam_graph.backend.cost.feature_tracks import Observations, is_in
 from slam_graph.backend.cost.gating import (
     Gate,
     Innovations,
-    distances_of_observations,
-    distances_of_rows,
     distances_of_tracks,
-    threshold,
+    passing,
 )
 from slam_graph.backend.cost.measurement_rows import (
     gated_columns,
@@ -43,7 +41,7 @@ from slam_graph.backend.cost.reprojection import Geometry, RigProjection
 from slam_graph.backend.cost.robust_loss import RobustLoss
 from slam_graph.backend.cost.triangulation import first_centres, moved_in_inverse_depth
 from slam_graph.backend.cost.unit_of_length import without_scale
-from slam_graph.backend.cost.whitened_update import GatedRows
+from slam_graph.backend.cost.whitened_update import GateRoot
 from slam_graph.backend.solve.square_root import Layout, SquareRootInformation
 from slam_graph.backend.solve.state import POINT_DIM, State, dims_of, landmark_keys
 
@@ -337,7 +335,7 @@ class Cost:
         predicted: SquareRootInformation,
         tested: BoolArray | None = None,
         admitted: tuple[BoolArray | bool, BoolArray | bool] = (True, True),
-        known: GatedRows | None = None,
+        known: GateRoot | None = None,
     ) -> Gate:
         """Which tracked observations and new features pass the χ² test.
 
@@ -347,49 +345,35 @@ class Cost:
             predicted: what is known of the variables before these measurements.
             tested: (J,) which of the new features are tested; all of them if it is not given.
             admitted: which observations (N,) and which of the tested features may pass; else all.
-            known: the rows of all of them, if they are known.
+            known: what was found for all of them, if it is there already.
         """
-        landmarks = tracks = np.zeros(0, np.bool_)
-        innovations, confidence = Innovations(), self.config.gating.confidence
         obs = None if self.tracks is None or linear.tracks is None else self.tracks.obs
         if obs is not None and tested is not None:  # they are new: few poses have seen them
-            obs, tracks = obs.subset(tested).without_idle_frames(), np.zeros(len(tested), np.bool_)
-        of_state = self.landmarks if linear.landmarks is not None and known is None else None
-        columns, of_poses = gated_columns(of_state, obs, self.rig, predicted.layout)
-        columns = columns if known is None else known.columns
-        first = min(int(part.min(initial=predicted.layout.size)) for part in (columns, of_poses))
-        if first == predicted.layout.size:  # no observations
+            obs = obs.subset(tested).without_idle_frames()
+        of_state = None if linear.landmarks is None else self.landmarks
+        columns, poses = gated_columns(of_state, obs, self.rig, predicted.layout)
+        landmarks = np.zeros(0, np.bool_)
+        tracks = np.zeros(0 if tested is None else len(tested), np.bool_)
+        innovations, confidence = Innovations(), self.config.gating.confidence
+        if not len(columns) and not len(poses):
             return Gate(landmarks, tracks, innovations)
-        first = first if known is None else known.root.first
-        W = predicted.root_from(first) if known is None else known.root.W
-        if linear.landmarks is not None and self.landmarks is not None:
-            if known is None:
-                distance = distances_of_observations(linear.landmarks, W, columns - first)
-            else:
-                distance = distances_of_rows(linear.landmarks.r, known.rows)
-            dof = np.full(len(distance), 2)
-            largest = threshold(dof, confidence)
+        root = GateRoot.of(predicted, columns, poses) if known is None else known
+        if of_state is not None and linear.landmarks is not None:
             # nearer or behind, the slope of the projection is so large that any residual would pass
             near = linear.landmarks.depths < self.config.triangulation.min_depth_m
-            landmarks = (distance < largest) & ~near & admitted[0]
-            innovations += Innovations.of(distance, dof, largest, landmarks)
+            may_pass, distances = ~near & admitted[0], root.distances(linear.landmarks)
+            dof = np.full(len(distances), 2)
+            landmarks, innovations = passing(distances, dof, confidence, may_pass)
         if obs is not None and len(obs) and self.tracks is not None:
-            observations = linear.tracks
-            assert isinstance(observations, WhitenedObservations), "these are not told apart"
+            assert isinstance(linear.tracks, WhitenedObservations), "these are not told apart"
+            observed, W = linear.tracks, root.root.last_rows(poses)
             if tested is not None:
-                observations = observations.subset(tested[self.tracks.obs.feature])
-            if known is not None and tested is None:
-                root_of_poses = known.pose_root
-            else:
-                above = int(of_poses.min()) - first  # rows before are zero: the root is triangular
-                root_of_poses = W[above:, of_poses - first]
-            covariance = root_of_poses.T @ root_of_poses
-            distance = distances_of_tracks(obs, observations, covariance)
+                observed = observed.subset(tested[self.tracks.obs.feature])
+            distances = distances_of_tracks(obs, observed, W.T @ W)
             dof = 2 * obs.counts - POINT_DIM
-            largest = threshold(dof, confidence)
-            passed = (distance < largest) & admitted[1]
-            innovations += Innovations.of(distance, dof, largest, passed)
+            passed, of_tracks = passing(distances, dof, confidence, admitted[1])
             tracks = is_in(self.tracks.obs.ids, obs.ids[passed])
+            innovations += of_tracks
         return Gate(landmarks, tracks, innovations)
 
 

@@ -177,6 +177,22 @@ def distances_of_tracks(
     return distances
 
 
+def passing(
+    distances: FloatArray, dof: NDArray[np.int64], confidence: float, may_pass: BoolArray | bool
+) -> tuple[BoolArray, Innovations]:
+    """Which of J measurements pass the test, and how far all of them were.
+
+    Args:
+        distances: (J,) squared Mahalanobis distances.
+        dof: (J,) their degrees of freedom.
+        confidence: share of right measurements that pass.
+        may_pass: (J,) those that may pass; or all, or none.
+    """
+    largest = threshold(dof, confidence)
+    passed = (distances < largest) & may_pass
+    return passed, Innovations.of(distances, dof, largest, passed)
+
+
 def threshold(dof: NDArray[np.int64], confidence: float) -> FloatArray:
     """The χ² quantile for each number of degrees of freedom."""
     table = _quantiles(int(dof.max(initial=1)), confidence)

@@ -18,6 +18,8 @@ from numpy.typing import NDArray
 from scipy.linalg import blas, lapack
 
 from slam_graph.arrays import FloatArray
+from slam_graph.backend.cost.feature_factors import WhitenedObservations
+from slam_graph.backend.cost.gating import distances_of_observations, distances_of_rows
 from slam_graph.backend.solve.square_root import SquareRootInformation
 from slam_graph.kernels.gate import observation_rows
 
@@ -39,45 +41,79 @@ class TailRoot:
         """That of all columns from one on."""
         return TailRoot(first, gaussian.root_from(first))
 
-    def columns(self, numbers: NDArray[np.intp]) -> FloatArray:
-        """Columns (m, k) of it, by their numbers in the Gaussian."""
-        return np.asarray(self.W.T.take(numbers - self.first, axis=0).T)  # contiguous ones
+    def last_rows(self, columns: NDArray[np.intp]) -> FloatArray:
+        """The last rows (q, k) of columns, by their numbers in the Gaussian; those before are zero.
+
+        It is a root of the covariance of these variables.
+        """
+        own = columns - self.first
+        zeros = int(own.min(initial=len(self.W)))
+        return np.asarray(self.W.T.take(own, axis=0).T)[zeros:]  # contiguous columns
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class GatedRows:
-    """What the gate knows of the observations of a step, m variables.
+class GateRoot:
+    """What the gate knows of the variables that the observations of a step depend on.
 
     Attributes:
-        root: of the covariance of all variables that they depend on.
+        root: of their covariance, m variables.
         columns: (N, 9 + C) of observations of features of the state.
-        poses: (6 F + C,) columns of poses and calibration of new features.
-        rows: (N, 2, m) derivatives of the former by whitened variables.
-        pose_root: (q, 6 F + C) the last rows of the root in the columns of poses; those before are
-            zero.
     """
 
     root: TailRoot
     columns: NDArray[np.intp]
+
+    @staticmethod
+    def of(
+        gaussian: SquareRootInformation, columns: NDArray[np.intp], poses: NDArray[np.intp]
+    ) -> GateRoot:
+        """That of such columns, and of those (6 F + C,) of the poses of new features."""
+        return GateRoot(TailRoot.of(gaussian, _first(gaussian, columns, poses)), columns)
+
+    def distances(self, linear: WhitenedObservations) -> FloatArray:
+        """Squared Mahalanobis distances (N,) of the observations of features of the state."""
+        return distances_of_observations(linear, self.root.W, self.columns - self.root.first)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class GatedRows(GateRoot):
+    """The same with what two tests of the same observations share.
+
+    Attributes:
+        poses: (6 F + C,) columns of poses and calibration of new features.
+        rows: (N, 2, m) derivatives of observations of features of the state by whitened variables.
+        pose_root: (q, 6 F + C) the last rows of the root in the columns of poses; those before are
+            zero.
+    """
+
     poses: NDArray[np.intp]
     rows: FloatArray
     pose_root: FloatArray
 
     @staticmethod
-    def of(
+    def with_rows(
         gaussian: SquareRootInformation,
         columns: NDArray[np.intp],
         poses: NDArray[np.intp],
         H: FloatArray,
     ) -> GatedRows:
         """Those of observations with derivatives H (N, 2, 9 + C)."""
-        size = gaussian.layout.size
-        first = min(int(part.min(initial=size)) for part in (columns, poses))
-        root = TailRoot.of(gaussian, first)
+        root = TailRoot.of(gaussian, _first(gaussian, columns, poses))
         rows = np.empty((len(H), 2, len(root.W)))
-        observation_rows(H, root.W, columns - first, rows.reshape(-1, len(root.W)))
-        zeros = int(poses.min(initial=size)) - first
-        return GatedRows(root, columns, poses, rows, root.columns(poses)[zeros:])
+        observation_rows(H, root.W, columns - root.first, rows.reshape(-1, len(root.W)))
+        return GatedRows(root, columns, poses, rows, root.last_rows(poses))
+
+    def distances(self, linear: WhitenedObservations) -> FloatArray:
+        """As `GateRoot.distances`, from the rows."""
+        return distances_of_rows(linear.r, self.rows)
+
+
+def _first(
+    gaussian: SquareRootInformation, columns: NDArray[np.intp], poses: NDArray[np.intp]
+) -> int:
+    """The first of all columns; their number if there are none."""
+    size = gaussian.layout.size
+    return min(int(part.min(initial=size)) for part in (columns, poses))
 
 
 class WhitenedUpdate:
