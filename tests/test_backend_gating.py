@@ -24,8 +24,10 @@ from slam_graph.backend.cost.gating import (
     squared_mahalanobis,
     threshold,
 )
+from slam_graph.backend.cost.measurement_rows import gated_columns
 from slam_graph.backend.cost.reprojection import Geometry, RigProjection
 from slam_graph.backend.cost.triangulation import triangulate
+from slam_graph.backend.cost.whitened_update import GatedRows, GateRoot
 from slam_graph.backend.solve.square_root import Layout, SquareRootInformation
 from slam_graph.backend.solve.state import State, dims_of
 from slam_graph.geometry.trajectory import NavState
@@ -210,6 +212,32 @@ def test_wrong_tracked_observations_are_rejected_one_by_one() -> None:
     assert len(gate.tracks) == 0
     assert not gate.landmarks[bad].any()
     assert gate.landmarks[~bad].mean() > 0.8
+
+
+def test_the_gate_is_the_same_where_roots_and_rows_are_known_already() -> None:
+    rng = np.random.default_rng(47)
+    cost, _, P, layout = tracked_cost(trial(rng), rng)
+    assert cost.landmarks is not None
+    linear, predicted = cost.linearize(), known(P, layout)
+    assert linear.landmarks is not None
+    columns, poses = gated_columns(cost.landmarks, None, cost.rig, layout)
+    rows = GatedRows.with_rows(predicted, columns, poses, linear.landmarks.H)
+    root = GateRoot.of(predicted, columns, poses)
+    np.testing.assert_allclose(
+        rows.distances(linear.landmarks), root.distances(linear.landmarks), rtol=1e-9
+    )
+    gates = [cost.gate(linear, predicted, known=each) for each in (None, root, rows)]
+    for gate in gates[1:]:
+        np.testing.assert_array_equal(gate.landmarks, gates[0].landmarks)
+
+
+def test_new_features_none_of_which_is_tested_all_fail() -> None:
+    case = trial(np.random.default_rng(53))
+    cost, linear = track_cost(case)
+    none = np.zeros(len(case.obs.ids), np.bool_)
+    gate = cost.gate(linear, known(case.covariance, case.layout), tested=none)
+    np.testing.assert_array_equal(gate.tracks, none)
+    assert gate.innovations.tested == 0
 
 
 def test_thresholds_are_quantiles() -> None:
