@@ -27,7 +27,7 @@ from slam_graph.backend.cost.gating import (
 from slam_graph.backend.cost.measurement_rows import gated_columns
 from slam_graph.backend.cost.reprojection import Geometry, RigProjection
 from slam_graph.backend.cost.triangulation import triangulate
-from slam_graph.backend.cost.whitened_update import GatedRows, GateRoot
+from slam_graph.backend.cost.whitened_update import gate_root, gated_rows
 from slam_graph.backend.solve.square_root import Layout, SquareRootInformation
 from slam_graph.backend.solve.state import State, dims_of
 from slam_graph.geometry.trajectory import NavState
@@ -214,30 +214,73 @@ def test_wrong_tracked_observations_are_rejected_one_by_one() -> None:
     assert gate.landmarks[~bad].mean() > 0.8
 
 
-def test_the_gate_is_the_same_where_roots_and_rows_are_known_already() -> None:
+@pytest.fixture(scope="module")
+def mixed() -> tuple[Cost, Linearization, SquareRootInformation]:
+    """A cost with features of the state and new ones, six and more of each."""
     rng = np.random.default_rng(47)
-    cost, _, P, layout = tracked_cost(trial(rng), rng)
+    case = trial(rng)
+    while len(case.obs.ids) < 12:
+        case = trial(rng)
+    held = np.arange(len(case.obs.ids)) < 6
+    both = track_cost(case)[0].tracks
+    assert both is not None
+    cost, _, P, layout = tracked_cost(replace(case, obs=case.obs.subset(held)), rng)
+    cost.tracks = both.subset(~held)
+    return cost, cost.linearize(), known(P, layout)
+
+
+@pytest.mark.parametrize("some", [False, True])
+def test_the_gate_is_the_same_where_roots_and_rows_are_known_already(
+    mixed: tuple[Cost, Linearization, SquareRootInformation], some: bool
+) -> None:
+    cost, linear, predicted = mixed
     assert cost.landmarks is not None
-    linear, predicted = cost.linearize(), known(P, layout)
+    assert cost.tracks is not None
     assert linear.landmarks is not None
-    columns, poses = gated_columns(cost.landmarks, None, cost.rig, layout)
-    rows = GatedRows.with_rows(predicted, columns, poses, linear.landmarks.H)
-    root = GateRoot.of(predicted, columns, poses)
-    np.testing.assert_allclose(
-        rows.distances(linear.landmarks), root.distances(linear.landmarks), rtol=1e-9
+    tested = np.arange(len(cost.tracks.obs.ids)) % 2 == 0 if some else None
+    obs = cost.tracks.obs if tested is None else cost.tracks.obs.subset(tested)
+    obs = obs.without_idle_frames()
+    columns, poses = gated_columns(cost.landmarks, obs, cost.rig, predicted.layout)
+    roots = (
+        gate_root(predicted, columns, poses),
+        gated_rows(predicted, columns, poses, linear.landmarks.H),
     )
-    gates = [cost.gate(linear, predicted, known=each) for each in (None, root, rows)]
-    for gate in gates[1:]:
-        np.testing.assert_array_equal(gate.landmarks, gates[0].landmarks)
+    distances = [root.distances(linear.landmarks) for root in roots]
+    np.testing.assert_allclose(distances[1], distances[0], rtol=1e-9)
+    gate = cost.gate(linear, predicted, tested)
+    assert gate.innovations.tested == len(cost.landmarks) + len(obs.ids)
+    for root in roots:
+        found = cost.gate(linear, predicted, tested, known=root)
+        np.testing.assert_array_equal(found.landmarks, gate.landmarks)
+        np.testing.assert_array_equal(found.tracks, gate.tracks)
+        np.testing.assert_allclose(astuple(found.innovations), astuple(gate.innovations))
 
 
-def test_new_features_none_of_which_is_tested_all_fail() -> None:
-    case = trial(np.random.default_rng(53))
-    cost, linear = track_cost(case)
-    none = np.zeros(len(case.obs.ids), np.bool_)
-    gate = cost.gate(linear, known(case.covariance, case.layout), tested=none)
+def test_what_is_too_near_does_not_pass(
+    mixed: tuple[Cost, Linearization, SquareRootInformation],
+) -> None:
+    cost, linear, predicted = mixed
+    assert linear.landmarks is not None
+    passed = cost.gate(linear, predicted).landmarks
+    nearest_m = float(np.median(linear.landmarks.depths))
+    triangulation = cost.config.triangulation.model_copy(update={"min_depth_m": nearest_m})
+    config = cost.config.model_copy(update={"triangulation": triangulation})
+    far = linear.landmarks.depths >= nearest_m
+    gate = replace(cost, config=config).gate(linear, predicted)
+    np.testing.assert_array_equal(gate.landmarks, passed & far)
+    assert passed[~far].any()
+
+
+def test_new_features_none_of_which_is_tested_all_fail(
+    mixed: tuple[Cost, Linearization, SquareRootInformation],
+) -> None:
+    cost, linear, predicted = mixed
+    assert cost.landmarks is not None
+    assert cost.tracks is not None
+    none = np.zeros(len(cost.tracks.obs.ids), np.bool_)
+    gate = cost.gate(linear, predicted, tested=none)
     np.testing.assert_array_equal(gate.tracks, none)
-    assert gate.innovations.tested == 0
+    assert gate.innovations.tested == len(cost.landmarks)
 
 
 def test_thresholds_are_quantiles() -> None:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from slam_graph.backend.cost.gating import distances_of_rows, squared_mahalanobis
-from slam_graph.backend.cost.whitened_update import GatedRows, TailRoot, WhitenedUpdate
+from slam_graph.backend.cost.whitened_update import TailRoot, WhitenedUpdate, gated_rows
 from slam_graph.backend.solve.square_root import Layout, SquareRootInformation
 
 
@@ -34,13 +34,13 @@ def test_distances_by_rows_are_those_by_the_covariance() -> None:
     before = SquareRootInformation(Layout(dict.fromkeys(range(8), 10)), Rd)
     columns = np.array([rng.choice(np.arange(20, 80), 9, replace=False) for _ in range(12)])
     H, r = rng.normal(size=(12, 2, 9)), rng.normal(size=(12, 2))
-    known = GatedRows.with_rows(before, columns, np.arange(70, 80), H)
-    assert known.root.first == columns.min()
+    known = gated_rows(before, columns, np.arange(70, 80), H)
+    assert known.tail.first == columns.min()
     A = np.zeros((12, 2, 81))
     A[np.arange(12)[:, None], :, columns] = H.transpose(0, 2, 1)
     A[:, :, -1] = r
     of_some = known.rows[:5].reshape(10, -1)
-    update = WhitenedUpdate(before, known.root, of_some, r[:5].ravel())
+    update = WhitenedUpdate(before, known.tail, of_some, r[:5].ravel())
     reduction = update.reduction(known.rows.reshape(24, -1)).reshape(12, 2, -1)
     after = before.updated(A[:5].reshape(10, -1))
     for gaussian, found in (
@@ -50,7 +50,7 @@ def test_distances_by_rows_are_those_by_the_covariance() -> None:
         P = gaussian.covariance()[columns[:, :, None], columns[:, None, :]]
         np.testing.assert_allclose(found, squared_mahalanobis(r, H, P), rtol=1e-9)
     root = known.pose_root  # without the rows that are zero
-    assert len(root) < len(known.root.W)
+    assert len(root) < len(known.tail.W)
     np.testing.assert_allclose(root.T @ root, before.covariance()[70:, 70:], rtol=1e-9, atol=1e-12)
     np.testing.assert_allclose(
         update.covariance(root), after.covariance()[70:, 70:], rtol=1e-9, atol=1e-12

@@ -31,7 +31,7 @@ from slam_graph.backend.cost.gating import (
 )
 from slam_graph.backend.cost.measurement_rows import gated_columns
 from slam_graph.backend.cost.robust_loss import MEDIAN_2D, WIDTH_2D
-from slam_graph.backend.cost.whitened_update import GatedRows, WhitenedUpdate
+from slam_graph.backend.cost.whitened_update import GatedRows, WhitenedUpdate, gated_rows
 from slam_graph.backend.solve.square_root import SquareRootInformation
 from slam_graph.backend.solve.state import POINT_DIM
 
@@ -76,13 +76,16 @@ def gate_by_consensus(
         return cost.gate(linear, predicted, tested)
     known = _gated_rows(cost, linear, predicted)
     try:
-        update = WhitenedUpdate(predicted, known.root, *_rows(cost, linear, known, consensus))
+        update = WhitenedUpdate(predicted, known.tail, *_rows(cost, linear, known, consensus))
     except np.linalg.LinAlgError:
         return cost.gate(linear, predicted, tested)
     landmarks = consensus.landmarks | _landmarks_pass(linear, update, known)
     others = ~consensus.tracks if tested is None else tested & ~consensus.tracks
     tracks = consensus.tracks | _tracks_pass(cost, linear, update, known, others)
     admitted = landmarks, tracks if tested is None else tracks[tested]
+    if tested is not None and cost.tracks is not None:
+        obs = cost.tracks.obs.subset(tested).without_idle_frames()
+        known = known.of_poses(gated_columns(None, obs, cost.rig, predicted.layout)[1])
     return cost.gate(linear, predicted, tested, admitted=admitted, known=known)
 
 
@@ -92,7 +95,7 @@ def _gated_rows(cost: Cost, linear: Linearization, predicted: SquareRootInformat
     tracks = None if linear.tracks is None or cost.tracks is None else cost.tracks.obs
     columns, poses = gated_columns(landmarks, tracks, cost.rig, predicted.layout)
     H = np.zeros((0, 2, 9)) if linear.landmarks is None else linear.landmarks.H
-    return GatedRows.with_rows(predicted, columns, poses, H)
+    return gated_rows(predicted, columns, poses, H)
 
 
 def _landmarks_pass(linear: Linearization, update: WhitenedUpdate, known: GatedRows) -> BoolArray:
@@ -180,7 +183,7 @@ def _rows(
     cost: Cost, linear: Linearization, known: GatedRows, consensus: _Consensus
 ) -> tuple[FloatArray, FloatArray]:
     """Rows [Y b] of the consensus by whitened variables, of new features those of the poses."""
-    m = len(known.root.W)
+    m = len(known.tail.W)
     Y, b = [np.zeros((0, m))], [np.zeros(0)]
     if linear.landmarks is not None:
         chosen = consensus.landmarks.nonzero()[0]

@@ -41,7 +41,7 @@ from slam_graph.backend.cost.reprojection import Geometry, RigProjection
 from slam_graph.backend.cost.robust_loss import RobustLoss
 from slam_graph.backend.cost.triangulation import first_centres, moved_in_inverse_depth
 from slam_graph.backend.cost.unit_of_length import without_scale
-from slam_graph.backend.cost.whitened_update import GateRoot
+from slam_graph.backend.cost.whitened_update import GateRoot, gate_root
 from slam_graph.backend.solve.square_root import Layout, SquareRootInformation
 from slam_graph.backend.solve.state import POINT_DIM, State, dims_of, landmark_keys
 
@@ -345,31 +345,33 @@ class Cost:
             predicted: what is known of the variables before these measurements.
             tested: (J,) which of the new features are tested; all of them if it is not given.
             admitted: which observations (N,) and which of the tested features may pass; else all.
-            known: what was found for all of them, if it is there already.
+            known: the root for these observations, where it was found already.
         """
         obs = None if self.tracks is None or linear.tracks is None else self.tracks.obs
         if obs is not None and tested is not None:  # they are new: few poses have seen them
             obs = obs.subset(tested).without_idle_frames()
-        of_state = None if linear.landmarks is None else self.landmarks
-        columns, poses = gated_columns(of_state, obs, self.rig, predicted.layout)
         landmarks = np.zeros(0, np.bool_)
         tracks = np.zeros(0 if tested is None else len(tested), np.bool_)
         innovations, confidence = Innovations(), self.config.gating.confidence
-        if not len(columns) and not len(poses):
-            return Gate(landmarks, tracks, innovations)
-        root = GateRoot.of(predicted, columns, poses) if known is None else known
-        if of_state is not None and linear.landmarks is not None:
+        if known is None:
+            of_state = None if linear.landmarks is None else self.landmarks
+            columns, poses = gated_columns(of_state, obs, self.rig, predicted.layout)
+            if not len(columns) and not len(poses):
+                return Gate(landmarks, tracks, innovations)
+            known = gate_root(predicted, columns, poses)
+        if linear.landmarks is not None:
             # nearer or behind, the slope of the projection is so large that any residual would pass
             near = linear.landmarks.depths < self.config.triangulation.min_depth_m
-            may_pass, distances = ~near & admitted[0], root.distances(linear.landmarks)
+            distances = known.distances(linear.landmarks)
             dof = np.full(len(distances), 2)
-            landmarks, innovations = passing(distances, dof, confidence, may_pass)
+            landmarks, innovations = passing(distances, dof, confidence, ~near & admitted[0])
         if obs is not None and len(obs) and self.tracks is not None:
-            assert isinstance(linear.tracks, WhitenedObservations), "these are not told apart"
-            observed, W = linear.tracks, root.root.last_rows(poses)
+            observed = linear.tracks
+            assert isinstance(observed, WhitenedObservations), "these are not told apart"
             if tested is not None:
                 observed = observed.subset(tested[self.tracks.obs.feature])
-            distances = distances_of_tracks(obs, observed, W.T @ W)
+            covariance = known.pose_root.T @ known.pose_root
+            distances = distances_of_tracks(obs, observed, covariance)
             dof = 2 * obs.counts - POINT_DIM
             passed, of_tracks = passing(distances, dof, confidence, admitted[1])
             tracks = is_in(self.tracks.obs.ids, obs.ids[passed])

@@ -11,7 +11,8 @@ QR and its inverse.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,9 +43,13 @@ class TailRoot:
         return TailRoot(first, gaussian.root_from(first))
 
     def last_rows(self, columns: NDArray[np.intp]) -> FloatArray:
-        """The last rows (q, k) of columns, by their numbers in the Gaussian; those before are zero.
+        """Columns (q, k) of W without the leading rows that are zero in all of them.
 
-        It is a root of the covariance of these variables.
+        Args:
+            columns: (k,) their numbers in the Gaussian.
+
+        Returns:
+            A root of the covariance of these variables.
         """
         own = columns - self.first
         zeros = int(own.min(initial=len(self.W)))
@@ -53,67 +58,72 @@ class TailRoot:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GateRoot:
-    """What the gate knows of the variables that the observations of a step depend on.
+    """A root of the covariance of the variables that the observations of a step depend on.
 
     Attributes:
-        root: of their covariance, m variables.
+        tail: the root, from the first of these variables on; m variables.
         columns: (N, 9 + C) of observations of features of the state.
+        pose_root: (q, 6 F + C) its last rows in the columns of poses and calibration of new
+            features; those before are zero.
     """
 
-    root: TailRoot
+    tail: TailRoot
     columns: NDArray[np.intp]
+    pose_root: FloatArray
 
-    @staticmethod
-    def of(
-        gaussian: SquareRootInformation, columns: NDArray[np.intp], poses: NDArray[np.intp]
-    ) -> GateRoot:
-        """That of such columns, and of those (6 F + C,) of the poses of new features."""
-        return GateRoot(TailRoot.of(gaussian, _first(gaussian, columns, poses)), columns)
+    def of_poses(self, poses: NDArray[np.intp]) -> Self:
+        """The same for other new features, with columns (6 F + C,) of poses and calibration."""
+        return replace(self, pose_root=self.tail.last_rows(poses))
 
     def distances(self, linear: WhitenedObservations) -> FloatArray:
         """Squared Mahalanobis distances (N,) of the observations of features of the state."""
-        return distances_of_observations(linear, self.root.W, self.columns - self.root.first)
+        return distances_of_observations(linear, self.tail.W, self.columns - self.tail.first)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GatedRows(GateRoot):
-    """The same with what two tests of the same observations share.
+    """The root with the derivatives of observations, for two tests of the same ones.
 
     Attributes:
         poses: (6 F + C,) columns of poses and calibration of new features.
         rows: (N, 2, m) derivatives of observations of features of the state by whitened variables.
-        pose_root: (q, 6 F + C) the last rows of the root in the columns of poses; those before are
-            zero.
     """
 
     poses: NDArray[np.intp]
     rows: FloatArray
-    pose_root: FloatArray
-
-    @staticmethod
-    def with_rows(
-        gaussian: SquareRootInformation,
-        columns: NDArray[np.intp],
-        poses: NDArray[np.intp],
-        H: FloatArray,
-    ) -> GatedRows:
-        """Those of observations with derivatives H (N, 2, 9 + C)."""
-        root = TailRoot.of(gaussian, _first(gaussian, columns, poses))
-        rows = np.empty((len(H), 2, len(root.W)))
-        observation_rows(H, root.W, columns - root.first, rows.reshape(-1, len(root.W)))
-        return GatedRows(root, columns, poses, rows, root.last_rows(poses))
 
     def distances(self, linear: WhitenedObservations) -> FloatArray:
         """As `GateRoot.distances`, from the rows."""
         return distances_of_rows(linear.r, self.rows)
 
 
-def _first(
+def gate_root(
     gaussian: SquareRootInformation, columns: NDArray[np.intp], poses: NDArray[np.intp]
-) -> int:
-    """The first of all columns; their number if there are none."""
+) -> GateRoot:
+    """The root for the observations of a step.
+
+    Args:
+        gaussian: what is known before them.
+        columns: (N, 9 + C) of observations of features of the state.
+        poses: (6 F + C,) columns of poses and calibration of new features.
+    """
     size = gaussian.layout.size
-    return min(int(part.min(initial=size)) for part in (columns, poses))
+    tail = TailRoot.of(gaussian, min(int(part.min(initial=size)) for part in (columns, poses)))
+    return GateRoot(tail, columns, tail.last_rows(poses))
+
+
+def gated_rows(
+    gaussian: SquareRootInformation,
+    columns: NDArray[np.intp],
+    poses: NDArray[np.intp],
+    H: FloatArray,
+) -> GatedRows:
+    """The same with the rows of observations with derivatives H (N, 2, 9 + C)."""
+    root = gate_root(gaussian, columns, poses)
+    W = root.tail.W
+    rows = np.empty((len(H), 2, len(W)))
+    observation_rows(H, W, columns - root.tail.first, rows.reshape(-1, len(W)))
+    return GatedRows(root.tail, columns, root.pose_root, poses, rows)
 
 
 class WhitenedUpdate:
