@@ -216,12 +216,12 @@ def test_wrong_tracked_observations_are_rejected_one_by_one() -> None:
 
 @pytest.fixture(scope="module")
 def mixed() -> tuple[Cost, Linearization, SquareRootInformation]:
-    """A cost with features of the state and new ones, six and more of each."""
+    """A cost with four features of the state and as many new ones or more."""
     rng = np.random.default_rng(47)
     case = trial(rng)
-    while len(case.obs.ids) < 12:
+    while len(case.obs.ids) < 8:
         case = trial(rng)
-    held = np.arange(len(case.obs.ids)) < 6
+    held = np.arange(len(case.obs.ids)) < 4
     both = track_cost(case)[0].tracks
     assert both is not None
     cost, _, P, layout = tracked_cost(replace(case, obs=case.obs.subset(held)), rng)
