@@ -74,7 +74,7 @@ def gate_by_consensus(
     consensus = _consensus(cost, linear)
     if consensus is None:
         return cost.gate(linear, predicted, tested)
-    known = _gated_rows(cost, linear, predicted)
+    known = _root_with_rows(cost, linear, predicted)
     try:
         update = WhitenedUpdate(predicted, known.tail, *_rows(cost, linear, known, consensus))
     except np.linalg.LinAlgError:
@@ -89,7 +89,7 @@ def gate_by_consensus(
     return cost.gate(linear, predicted, tested, admitted=admitted, known=known)
 
 
-def _gated_rows(cost: Cost, linear: Linearization, predicted: SquareRootInformation) -> GatedRows:
+def _root_with_rows(cost: Cost, linear: Linearization, predicted: SquareRootInformation) -> GatedRows:
     """What both tests need of all observations."""
     landmarks = None if linear.landmarks is None else cost.landmarks
     tracks = None if linear.tracks is None or cost.tracks is None else cost.tracks.obs

@@ -118,7 +118,14 @@ def gated_rows(
     poses: NDArray[np.intp],
     H: FloatArray,
 ) -> GatedRows:
-    """The same with the rows of observations with derivatives H (N, 2, 9 + C)."""
+    """The root for the observations of a step, and the rows of those of features of the state.
+
+    Args:
+        gaussian: what is known before them.
+        columns: (N, 9 + C) of observations of features of the state.
+        poses: (6 F + C,) columns of poses and calibration of new features.
+        H: (N, 2, 9 + C) derivatives of the former.
+    """
     root = gate_root(gaussian, columns, poses)
     W = root.tail.W
     rows = np.empty((len(H), 2, len(W)))
