@@ -89,7 +89,9 @@ def gate_by_consensus(
     return cost.gate(linear, predicted, tested, admitted=admitted, known=known)
 
 
-def _root_with_rows(cost: Cost, linear: Linearization, predicted: SquareRootInformation) -> GatedRows:
+def _root_with_rows(
+    cost: Cost, linear: Linearization, predicted: SquareRootInformation
+) -> GatedRows:
     """What both tests need of all observations."""
     landmarks = None if linear.landmarks is None else cost.landmarks
     tracks = None if linear.tracks is None or cost.tracks is None else cost.tracks.obs
