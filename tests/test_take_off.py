@@ -5,11 +5,12 @@
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import gtsam
 import numpy as np
 import pytest
 
 import slam_graph as sg
-from slam_graph.backend.initialization.take_off import RETRY_S, TakeOff, retry_s
+from slam_graph.backend.initialization.take_off import RETRY_S, TakeOff, retry_s, tells_scale
 from slam_graph.evaluation import nees_of_run
 from slam_graph.simulation.simulated_sequence import SimulatedSequence
 
@@ -166,6 +167,37 @@ def test_an_attempt_follows_as_soon_as_the_scale_can_be_known(
     waited_s = retry_s(elapsed_s, missing)
     assert waited_s <= max(known_s, RETRY_S)
     assert waited_s >= known_s - RETRY_S - 1e-9  # rounding
+
+
+def test_attempts_become_rare_as_the_platform_hovers() -> None:
+    assert retry_s(12.0, float("inf")) > 2.0 * RETRY_S
+
+
+@pytest.mark.data
+def test_a_given_state_that_hovers_before_it_moves(data_dir: Path) -> None:
+    """A hand moves the camera by 20 mm in five seconds; what the filter makes of it is no use."""
+    sequence = sg.simulate(
+        trajectory=data_dir / "tumvi_inertial" / "room1",
+        real_imu=True,
+        cameras=1,
+        rate_hz=10,
+        duration_s=15,
+        seed=1,
+        tracks={"features": 80},
+    )
+    run = sg.run(sequence, algorithm="swf", overrides=["final_ba.enabled=false"])
+    assert run.status == "ok"
+    assert len(run.segments) == 1
+    assert run.groundtruth is not None
+    world = sg.ape(run.groundtruth, run.trajectory, alignment="none").statistics.rmse
+    assert world < 0.05, "in the world of the given state"
+
+
+@pytest.mark.parametrize(("speed", "known"), [(0.0, False), (0.15, False), (0.3, True)])
+def test_a_velocity_tells_the_scale_if_it_is_known_well(speed: float, known: bool) -> None:
+    covariance = np.diag(np.repeat([1e-3, 1e-3, 0.02, 0.1, 0.01], 3) ** 2)
+    state = sg.NavState(0, gtsam.Pose3(), np.array([0.0, speed, 0.0]), covariance=covariance)
+    assert tells_scale(state) == known
 
 
 def test_without_a_deviation_or_with_one_that_is_small_the_next_attempt_is_soon() -> None:

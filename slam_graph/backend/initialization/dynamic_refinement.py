@@ -48,6 +48,8 @@ from slam_graph.geometry import NavState
 
 _BATCH = GaussNewtonPolicy(max_steps=15, tolerance=1e-4, damping="levenberg_marquardt")
 """How the batch problem is solved."""
+_PATIENT = _BATCH.model_copy(update={"max_steps": 30})
+"""The same from a guess that is far off: one that was 2 m off after 7 s took 17 steps."""
 _WHITE_NOISE_FACTOR = 1.5
 """Least factor on the calibrated white noise of the IMU: a start is over before the noise of a real
 one can be learned. Against a path that agrees with it, the IMU of TUM-VI's room1 is 1.2 to 1.9
@@ -100,6 +102,7 @@ class DynamicRefinement:
         max_scale_sigma: float,
         white_noise_factor: float = _WHITE_NOISE_FACTOR,
         hopeless: float = _HOPELESS,
+        patient: bool = False,
     ) -> None:
         """Prepare for attempts.
 
@@ -107,15 +110,14 @@ class DynamicRefinement:
             context: shared with the engine.
             max_scale_sigma: largest accepted standard deviation of the scale, relative to it.
             white_noise_factor: least factor on the calibrated white noise of the IMU.
-            hopeless: a guess whose scale is so many times less well known than accepted is not
-                refined.
+            hopeless: how many times less well than accepted a guess may tell the scale.
+            patient: whether no guess is given up for its first steps, as it may be far off.
         """
         self.outliers = np.zeros(0, np.int64)
         self.scale_sigma = float("inf")
-        self._context = context
-        self._max_scale_sigma = max_scale_sigma
-        self._white_noise_factor = white_noise_factor
-        self._hopeless_factor = hopeless
+        self._context, self._white_noise_factor = context, white_noise_factor
+        self._max_scale_sigma, self._hopeless_factor = max_scale_sigma, hopeless
+        self._patient, self._steps = patient, _PATIENT if patient else _BATCH
 
     def refine(
         self, frames: StartFrames, guess: StartGuess, first: NavState | None = None
@@ -135,15 +137,15 @@ class DynamicRefinement:
             hopeless = self._hopeless(cost, linear, len(guess.static))
             if hopeless is not None:
                 return hopeless
-            hopeful = self._hope(cost)
-            found = minimize(cost, _BATCH, linear, hopeful=hopeful)
-            if hopeful is not None and not found.converged:
+            hopeful = None if self._patient else self._hope(cost)
+            found = minimize(cost, self._steps, linear, hopeful=hopeful)
+            if not found.converged:
                 return _unsettled(found.costs[-1], cost)
             self._refine_motions(cost, frames)
             fit, seen = self._remove_outliers(cost, lasting)
             if fit < max(MIN_FEATURES, _MIN_INLIERS * seen):
                 return Refusal("fit", f"features that fit the motion ({fit} of {seen} do)")
-            minimize(cost, _BATCH)
+            minimize(cost, self._steps)
             self._refine_motions(cost, frames)
             features = self._keep_features(cost, frames)
             linear = cost.linearize(summed=True)
@@ -184,12 +186,11 @@ class DynamicRefinement:
             return Refusal("fit", f"features that fit the motion (0 of {static} do)")
         sigma = _scale_sigma(cost, linear, linearized(cost, linear))
         if sigma > self._hopeless_factor * self._max_scale_sigma:
-            needs = f"more motion (scale is known to {sigma:.0%} only)"
-            return Refusal("motion", needs)
+            return Refusal("motion", f"more motion (scale is known to {sigma:.0%} only)")
         return None
 
-    def _hope(self, cost: BatchCost) -> Hopeful | None:
-        """Whether a start may come of the steps so far; None if all are taken in any case."""
+    def _hope(self, cost: BatchCost) -> Hopeful:
+        """Whether a start may come of the steps so far."""
         assert cost.tracks is not None, "asked for before"
         tried, bar = 0, 0.5 * MAX_NORMALIZED_COST * _dof(cost.tracks)
 
@@ -237,8 +238,7 @@ class DynamicRefinement:
             needs = f"more motion (velocity is known to {velocity_sigma:.2g} m/s only)"
             return Refusal("motion", needs)
         if self.scale_sigma > self._max_scale_sigma:
-            needs = f"more motion (scale is known to {self.scale_sigma:.0%} only)"
-            return Refusal("motion", needs)
+            return Refusal("motion", f"more motion (scale is known to {self.scale_sigma:.0%} only)")
         return None
 
     def _batch_cost(

@@ -51,7 +51,7 @@ class StartFrames:
     @staticmethod
     def thinned(stamps_ns: list[int], frames: list[FeatureFrame], spacing_s: float) -> StartFrames:
         """The last frame, and going back every frame about `spacing_s` before the one chosen."""
-        chosen = [len(frames) - 1]
+        chosen = [len(frames) - 1] if frames else []
         for k in range(len(frames) - 2, -1, -1):
             if stamps_ns[chosen[-1]] - stamps_ns[k] >= round(spacing_s * 0.95e9):
                 chosen.append(k)

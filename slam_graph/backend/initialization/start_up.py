@@ -17,7 +17,7 @@ from slam_graph.backend.initialization.start_review import (
     contradict,
     warn_of_correction,
 )
-from slam_graph.backend.initialization.take_off import TakeOff
+from slam_graph.backend.initialization.take_off import TakeOff, tells_scale
 from slam_graph.backend.initialization.visual_start import VisualStart
 from slam_graph.backend.window import Window
 from slam_graph.geometry import NavState
@@ -72,9 +72,8 @@ class StartUp:
             scale_sigma = self._inertial.scale_sigma
             self._review = StartReview(self._context, stamp_ns, scale_sigma)
             self.doubtful = True
-            alone, engine = len(self._context.rig.cameras) == 1, self._context.algorithm.engine
-            if scale_sigma is None and alone and engine == "square_root":
-                self._take_off = TakeOff(self._context)
+            if scale_sigma is None:
+                self._watch_first_motion()
         window = self._placed(window)
         if search.leaves_frame:
             self._context.add_observations(window, frame)
@@ -134,6 +133,23 @@ class StartUp:
             return None
         self.outliers, self.contradicted = review.outliers, True
         return self._placed(window)
+
+    def begin_with(self, given: NavState) -> None:
+        """Begin with a state that is given.
+
+        Args:
+            given: with its covariance.
+        """
+        self.trust()
+        if self._inertial is not None and not tells_scale(given):
+            self._watch_first_motion()
+            self.doubtful = self._take_off is not None
+
+    def _watch_first_motion(self) -> None:
+        """Solve the first motion again, where one camera must find its scale in it."""
+        alone, engine = len(self._context.rig.cameras) == 1, self._context.algorithm.engine
+        if alone and engine == "square_root":
+            self._take_off = TakeOff(self._context)
 
     def trust(self) -> None:
         """Nothing of the start is in doubt any more."""

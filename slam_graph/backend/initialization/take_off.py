@@ -2,16 +2,20 @@
 # SPDX-License-Identifier: Apache-2.0
 """The first motion of one camera after a standstill, solved again as a batch problem.
 
-A camera that stands still knows no distances. In the first motion scale and depths become known
-together, beginning far from where they end, and a filter linearises each frame only once: at a
-scale that is a fifth off it becomes sure of a wrong one. So all states since the standstill are
-solved again together as soon as that determines the scale, and the estimator goes on from there.
-The world stays the same, and so do the states before if the solution does not contradict them.
+A camera that stands still, or hovers, knows no distances. In the first motion scale and depths
+become known together, beginning far from where they end, and a filter linearises each frame only
+once: at a scale that is a fifth off it becomes sure of a wrong one. So all states since the
+standstill are solved again together as soon as that determines the scale, and the estimator goes on
+from there. The world stays the same, and so do the states before if the solution does not
+contradict them.
 """
 
 from __future__ import annotations
 
 import math
+from bisect import bisect_left
+
+import numpy as np
 
 from slam_graph.arrays import IntArray
 from slam_graph.backend.engine_protocol import EngineContext
@@ -23,8 +27,11 @@ from slam_graph.backend.window import Window
 from slam_graph.geometry import NavState
 from slam_graph.sensors import FeatureFrame
 
-_SHORTEST_S, _LONGEST_S = 1.0, 5.0
-"""How long after the standstill the motion is solved at the earliest, and at the latest."""
+_SHORTEST_S, _LONGEST_S = 1.0, 15.0
+"""How long after the standstill the motion is solved at the earliest, and at the latest. A hand
+that holds a camera still moves it by 20 mm, which is no standstill, for five seconds and more."""
+_KNOWN_SPEED = 0.1
+"""A velocity with a smaller standard deviation, relative to it, tells the scale by itself."""
 _MAX_SCALE_SIGMA = 0.02
 """Largest standard deviation of the scale with which the estimator goes on, relative to it."""
 _HOPELESS_FACTOR = 1.5
@@ -36,8 +43,13 @@ _FASTEST_GAIN = 4.0
 the standstill: the way grows with its square under a constant acceleration, and the directions to
 the features change with the way. On good flights it was 2 to 3.4 (five pairs of attempts). Motion
 that begins later lets it fall faster; its solution then comes later, by up to the wait."""
-_MOST_FRAMES = 40
-"""About the most frames of the batch problem; where there are more, not all are used."""
+_MOST_FRAMES, _DENSE_NS = 40, 5_000_000_000
+"""About the most frames of the batch problem within so long a time before its last one; where there
+are more, not all are used."""
+_SPARSE_S = 1.0
+"""Time between its frames before that, when the platform did little but hover."""
+_RETRY_SHARE = 0.05
+"""Least time between two attempts, relative to that since the standstill."""
 _MIN_FRAMES = 3
 """Features that fewer of them see are not used."""
 
@@ -60,7 +72,11 @@ class TakeOff:
         self.done = False
         # the noise is that of the engine, which has learned some of it since the start
         self._refinement = DynamicRefinement(
-            context, _MAX_SCALE_SIGMA, white_noise_factor=1.0, hopeless=_HOPELESS_FACTOR
+            context,
+            _MAX_SCALE_SIGMA,
+            white_noise_factor=1.0,
+            hopeless=_HOPELESS_FACTOR,
+            patient=True,
         )
         self._states: list[NavState] = []
         self._frames: list[FeatureFrame] = []
@@ -104,13 +120,7 @@ class TakeOff:
 
     def _solution(self, dynamic: IntArray) -> Window | None:
         """The window that begins with the last frame; None if the scale is not known yet."""
-        stamps_ns = [state.stamp_ns for state in self._states]
-        static = [frame.without(dynamic) for frame in self._frames]
-        spacing_s = self.elapsed_ns * 1e-9 / _MOST_FRAMES
-        frames = StartFrames.thinned(stamps_ns, static, spacing_s)
-        if frames.stamps_ns[0] != stamps_ns[0]:
-            with_first = [stamps_ns[0], *frames.stamps_ns], [static[0], *frames.frames]
-            frames = StartFrames(*with_first)
+        frames = self._thinned([frame.without(dynamic) for frame in self._frames])
         chosen = set(frames.stamps_ns)
         states = [state for state in self._states if state.stamp_ns in chosen]
         ids, lengths = frames.tracks.lengths()
@@ -118,16 +128,46 @@ class TakeOff:
         found = self._refinement.refine(frames, guess, first=states[0])
         return None if isinstance(found, Refusal) else found
 
+    def _thinned(self, static: list[FeatureFrame]) -> StartFrames:
+        """The first and the last of the frames, and some between.
+
+        Args:
+            static: all frames, without what is known to move.
+        """
+        stamps_ns = [state.stamp_ns for state in self._states]
+        dense_ns = min(self.elapsed_ns, _DENSE_NS)
+        dense = bisect_left(stamps_ns, stamps_ns[-1] - dense_ns)
+        spacing_s = dense_ns * 1e-9 / _MOST_FRAMES
+        last = StartFrames.thinned(stamps_ns[dense:], static[dense:], spacing_s)
+        before = StartFrames.thinned(stamps_ns[:dense], static[:dense], _SPARSE_S)
+        thinned_ns = before.stamps_ns + last.stamps_ns
+        thinned = before.frames + last.frames
+        if thinned_ns[0] == stamps_ns[0]:
+            return StartFrames(thinned_ns, thinned)
+        return StartFrames([stamps_ns[0], *thinned_ns], [static[0], *thinned])
+
+
+def tells_scale(state: NavState) -> bool:
+    """Whether a state moves with a velocity that is known well enough to tell the scale.
+
+    Args:
+        state: with its covariance.
+    """
+    assert state.covariance is not None
+    sigma = np.sqrt(np.max(np.diag(state.covariance)[6:9]))
+    return bool(sigma < _KNOWN_SPEED * np.linalg.norm(state.velocity))
+
 
 def retry_s(elapsed_s: float, missing: float) -> float:
-    """Time from an attempt to the next, in seconds: whole times of `RETRY_S`.
+    """Time from an attempt to the next, in seconds.
 
     Args:
         elapsed_s: time since the standstill.
         missing: how many times too large the standard deviation of the scale was; infinite if the
             attempt did not come so far.
     """
+    least_s = max(RETRY_S, _RETRY_SHARE * elapsed_s)
     if not math.isfinite(missing):
-        return RETRY_S
+        return least_s
     grown = math.pow(missing, 1.0 / _FASTEST_GAIN)
-    return RETRY_S * max(elapsed_s * (grown - 1.0) // RETRY_S, 1.0)
+    return max(RETRY_S * (elapsed_s * (grown - 1.0) // RETRY_S), least_s)
