@@ -196,7 +196,9 @@ def test_a_given_state_that_hovers_before_it_moves(data_dir: Path) -> None:
 @pytest.mark.parametrize(("speed", "known"), [(0.0, False), (0.15, False), (0.3, True)])
 def test_a_velocity_tells_the_scale_if_it_is_known_well(speed: float, known: bool) -> None:
     covariance = np.diag(np.repeat([1e-3, 1e-3, 0.02, 0.1, 0.01], 3) ** 2)
-    state = sg.NavState(0, gtsam.Pose3(), np.array([0.0, speed, 0.0]), covariance=covariance)
+    velocity = np.array([0.0, speed, 0.0])
+    biases = {"accel_bias": np.zeros(3), "gyro_bias": np.zeros(3)}
+    state = sg.NavState(0, gtsam.Pose3(), velocity, **biases, covariance=covariance)
     assert tells_scale(state) == known
 
 
