@@ -173,26 +173,6 @@ def test_attempts_become_rare_as_the_platform_hovers() -> None:
     assert retry_s(12.0, float("inf")) > 2.0 * RETRY_S
 
 
-@pytest.mark.data
-def test_a_given_state_that_hovers_before_it_moves(data_dir: Path) -> None:
-    """A hand moves the camera by 20 mm in five seconds; what the filter makes of it is no use."""
-    sequence = sg.simulate(
-        trajectory=data_dir / "tumvi_inertial" / "room1",
-        real_imu=True,
-        cameras=1,
-        rate_hz=10,
-        duration_s=15,
-        seed=1,
-        tracks={"features": 80},
-    )
-    run = sg.run(sequence, algorithm="swf", overrides=["final_ba.enabled=false"])
-    assert run.status == "ok"
-    assert len(run.segments) == 1
-    assert run.groundtruth is not None
-    world = sg.ape(run.groundtruth, run.trajectory, alignment="none").statistics.rmse
-    assert world < 0.05, "in the world of the given state"
-
-
 @pytest.mark.parametrize(("speed", "known"), [(0.0, False), (0.15, False), (0.3, True)])
 def test_a_velocity_tells_the_scale_if_it_is_known_well(speed: float, known: bool) -> None:
     covariance = np.diag(np.repeat([1e-3, 1e-3, 0.02, 0.1, 0.01], 3) ** 2)

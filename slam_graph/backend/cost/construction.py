@@ -23,12 +23,8 @@ from slam_graph.backend.cost.consensus_gate import gate_by_consensus
 from slam_graph.backend.cost.cost import Cost, Linearization, TrackFeatures
 from slam_graph.backend.cost.feature_factors import WhitenedObservations
 from slam_graph.backend.cost.feature_selection import FeatureSelection, seen_by_leaving
-from slam_graph.backend.cost.feature_tracks import (
-    Observations,
-    Outcome,
-    Removals,
-    is_in,
-)
+from slam_graph.backend.cost.feature_tracks import Observations, Outcome, Removals, is_in
+from slam_graph.backend.cost.first_scale import FirstScale
 from slam_graph.backend.cost.gating import Gate, Innovations, threshold
 from slam_graph.backend.cost.pixel_noise import PixelNoise
 from slam_graph.backend.cost.reprojection import RigProjection
@@ -142,6 +138,7 @@ class CostConstruction:
         self._select_poses = POSE_SELECTIONS[policy.past_poses]
         self._loss = RobustLoss(config.gating.loss)
         self._by_consensus = by_consensus
+        self._first_scale = FirstScale(len(rig.cameras) > 1 or by_consensus)
         self._failures: dict[int, int] = {}
 
     def construct(self, window: Window, still: bool) -> ConstructedCost:
@@ -167,6 +164,8 @@ class CostConstruction:
         cost.tracks = self._selection.new_features(
             window, cost.state, poses, len(in_state), self._dynamic, removals
         )
+        if not self._first_scale.known(window, cost.state, predicted):
+            cost.tracks = None
         offered = cost.tracks
         gate, linear = self._apply_gate(window, cost, predicted, removals)
         if not self._features.relinearized:

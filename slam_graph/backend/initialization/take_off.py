@@ -46,6 +46,8 @@ that begins later lets it fall faster; its solution then comes later, by up to t
 _MOST_FRAMES, _DENSE_NS = 40, 5_000_000_000
 """About the most frames of the batch problem within so long a time before its last one; where there
 are more, not all are used."""
+_KEPT_NS = 9_000_000_000
+"""How long before its last frame the batch problem may begin: IMU samples are kept for longer."""
 _SPARSE_S = 1.0
 """Time between its frames before that, when the platform did little but hover."""
 _RETRY_SHARE = 0.05
@@ -80,7 +82,7 @@ class TakeOff:
         )
         self._states: list[NavState] = []
         self._frames: list[FeatureFrame] = []
-        self._next_ns = 0
+        self._begun_ns = self._next_ns = 0
 
     @property
     def outliers(self) -> IntArray:
@@ -90,7 +92,7 @@ class TakeOff:
     @property
     def elapsed_ns(self) -> int:
         """Time since the standstill."""
-        return self._states[-1].stamp_ns - self._states[0].stamp_ns
+        return self._states[-1].stamp_ns - self._begun_ns
 
     def solved(
         self, frame: FeatureFrame, dynamic: IntArray, state: NavState, still: bool
@@ -105,9 +107,12 @@ class TakeOff:
         """
         if still or not self._states:
             self._states, self._frames = [], []
+            self._begun_ns = state.stamp_ns
             self._next_ns = state.stamp_ns + round(_SHORTEST_S * 1e9)
         self._states.append(state)
         self._frames.append(frame)
+        while state.stamp_ns - self._states[0].stamp_ns > _KEPT_NS:
+            del self._states[0], self._frames[0]
         self.done = self.elapsed_ns > round(_LONGEST_S * 1e9)
         few = len(frame.without(dynamic).cameras[0]) < MIN_FEATURES
         if self.done or few or state.stamp_ns < self._next_ns:
