@@ -139,7 +139,7 @@ class DynamicRefinement:
                 return hopeless
             hopeful = None if self._patient else self._hope(cost)
             found = minimize(cost, self._steps, linear, hopeful=hopeful)
-            if not found.converged:
+            if hopeful is not None and not found.converged:
                 return _unsettled(found.costs[-1], cost)
             self._refine_motions(cost, frames)
             fit, seen = self._remove_outliers(cost, lasting)
@@ -189,8 +189,8 @@ class DynamicRefinement:
             return Refusal("motion", f"more motion (scale is known to {sigma:.0%} only)")
         return None
 
-    def _hope(self, cost: BatchCost) -> Hopeful:
-        """Whether a start may come of the steps so far."""
+    def _hope(self, cost: BatchCost) -> Hopeful | None:
+        """Whether a start may come of the steps so far; None if all are taken in any case."""
         assert cost.tracks is not None, "asked for before"
         tried, bar = 0, 0.5 * MAX_NORMALIZED_COST * _dof(cost.tracks)
 
