@@ -146,9 +146,9 @@ class Estimator(EstimatorKnowledge):
         if state.covariance is None:
             raise EstimationError("a start state needs a covariance")
         state = self._given = state if with_rate else self._dynamics.given(state)
-        self._start_up.begin_with(state)
         self._context.propagation.restart()
         self.window = start_from(state, self.config, self._context.calibration)
+        self._start_up.begin_with(state, self.window)
         self._engine = self._make_engine(self._context)  # nothing is left of an earlier start
         self.aiding.restart()
 

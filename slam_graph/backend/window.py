@@ -49,6 +49,8 @@ class Window:
             in the cost.
         last_points: the same of all features that the last step estimated outside the state.
         calibration: keys of the parameters of rig and position fixes that are in the state.
+        images_wait_until_ns: images are left out until it is known how far one camera has moved,
+            and up to this time at most; None if they are used.
     """
 
     frame: int
@@ -66,6 +68,7 @@ class Window:
     kept_points: tuple[IntArray, FloatArray] = field(default_factory=no_points)
     last_points: tuple[IntArray, FloatArray] = field(default_factory=no_points)
     calibration: tuple[int, ...] = ()
+    images_wait_until_ns: int | None = None
 
     def keys(self, past: Sequence[int], moving: Sequence[int], features: IntArray) -> list[int]:
         """Keys of some features, the calibration, past poses and past and current IMU states.

@@ -24,7 +24,7 @@ from slam_graph.backend.cost.cost import Cost, Linearization, TrackFeatures
 from slam_graph.backend.cost.feature_factors import WhitenedObservations
 from slam_graph.backend.cost.feature_selection import FeatureSelection, seen_by_leaving
 from slam_graph.backend.cost.feature_tracks import Observations, Outcome, Removals, is_in
-from slam_graph.backend.cost.first_scale import FirstScale
+from slam_graph.backend.cost.first_scale import images_wait
 from slam_graph.backend.cost.gating import Gate, Innovations, threshold
 from slam_graph.backend.cost.pixel_noise import PixelNoise
 from slam_graph.backend.cost.reprojection import RigProjection
@@ -64,8 +64,8 @@ class ConstructedCost:
         keep_lost_features: whether features that leave the state are kept for when they are seen
             again.
         removals: observations that go without being used.
-        predicted: what was known of the variables before the images; None if these are left out.
-            The steps change it.
+        predicted: what was known of the variables before the images; None at a standstill, and in a
+            step without images. The steps change it.
         remaining: the part of its cost that no values of the variables can remove.
         innovations: distances of the images from that.
         offered: the new features before the gate, without those that will come again.
@@ -138,7 +138,6 @@ class CostConstruction:
         self._select_poses = POSE_SELECTIONS[policy.past_poses]
         self._loss = RobustLoss(config.gating.loss)
         self._by_consensus = by_consensus
-        self._first_scale = FirstScale(len(rig.cameras) > 1 or by_consensus)
         self._failures: dict[int, int] = {}
 
     def construct(self, window: Window, still: bool) -> ConstructedCost:
@@ -161,11 +160,10 @@ class CostConstruction:
         predicted = cost.prior_at_estimate().updated(rows, overwrite=True, overwrite_rows=True)
         in_state = self._measured_again(window, cost.state)
         cost.landmarks = window.tracks.observations(in_state)
-        cost.tracks = self._selection.new_features(
-            window, cost.state, poses, len(in_state), self._dynamic, removals
-        )
-        if not self._first_scale.known(window, cost.state, predicted):
-            cost.tracks = None
+        if not images_wait(window, cost.state, predicted):
+            cost.tracks = self._selection.new_features(
+                window, cost.state, poses, len(in_state), self._dynamic, removals
+            )
         offered = cost.tracks
         gate, linear = self._apply_gate(window, cost, predicted, removals)
         if not self._features.relinearized:

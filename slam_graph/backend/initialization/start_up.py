@@ -17,7 +17,7 @@ from slam_graph.backend.initialization.start_review import (
     contradict,
     warn_of_correction,
 )
-from slam_graph.backend.initialization.take_off import TakeOff, tells_scale
+from slam_graph.backend.initialization.take_off import LONGEST_HOVER_S, TakeOff, tells_scale
 from slam_graph.backend.initialization.visual_start import VisualStart
 from slam_graph.backend.window import Window
 from slam_graph.geometry import NavState
@@ -72,8 +72,8 @@ class StartUp:
             scale_sigma = self._inertial.scale_sigma
             self._review = StartReview(self._context, stamp_ns, scale_sigma)
             self.doubtful = True
-            if scale_sigma is None:
-                self._watch_first_motion()
+            if scale_sigma is None and self._finds_scale:
+                self._take_off = TakeOff(self._context)
         window = self._placed(window)
         if search.leaves_frame:
             self._context.add_observations(window, frame)
@@ -134,22 +134,24 @@ class StartUp:
         self.outliers, self.contradicted = review.outliers, True
         return self._placed(window)
 
-    def begin_with(self, given: NavState) -> None:
+    def begin_with(self, given: NavState, window: Window) -> None:
         """Begin with a state that is given.
 
         Args:
             given: with its covariance.
+            window: that begins with it; images wait there if one camera must find its scale first.
         """
         self.trust()
-        if self._inertial is not None and not tells_scale(given):
-            self._watch_first_motion()
-            self.doubtful = self._take_off is not None
+        if self._inertial is None or not self._finds_scale or tells_scale(given):
+            return
+        self._take_off, self.doubtful = TakeOff(self._context, given=True), True
+        window.images_wait_until_ns = given.stamp_ns + round(LONGEST_HOVER_S * 1e9)
 
-    def _watch_first_motion(self) -> None:
-        """Solve the first motion again, where one camera must find its scale in it."""
+    @property
+    def _finds_scale(self) -> bool:
+        """Whether one camera finds its scale in the first motion, linearising each frame once."""
         alone, engine = len(self._context.rig.cameras) == 1, self._context.algorithm.engine
-        if alone and engine == "square_root":
-            self._take_off = TakeOff(self._context)
+        return alone and engine == "square_root"
 
     def trust(self) -> None:
         """Nothing of the start is in doubt any more."""

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""The first motion of one camera after a standstill, solved again as a batch problem.
+"""The first motion of one camera after a standstill or a given state, solved again as a batch.
 
 A camera that stands still, or hovers, knows no distances. In the first motion scale and depths
 become known together, beginning far from where they end, and a filter linearises each frame only
@@ -27,9 +27,11 @@ from slam_graph.backend.window import Window
 from slam_graph.geometry import NavState
 from slam_graph.sensors import FeatureFrame
 
-_SHORTEST_S, _LONGEST_S = 1.0, 15.0
-"""How long after the standstill the motion is solved at the earliest, and at the latest. A hand
-that holds a camera still moves it by 20 mm, which is no standstill, for five seconds and more."""
+_SHORTEST_S, _LONGEST_S = 1.0, 5.0
+"""How long after the standstill the motion is solved at the earliest, and at the latest."""
+LONGEST_HOVER_S = 15.0
+"""The latest after a given state. A hand that holds a camera still moves it by 20 mm, which is no
+standstill, for five seconds and more."""
 _KNOWN_SPEED = 0.1
 """A velocity with a smaller standard deviation, relative to it, tells the scale by itself."""
 _MAX_SCALE_SIGMA = 0.02
@@ -59,26 +61,30 @@ _MIN_FRAMES = 3
 class TakeOff:
     """Collects the states and frames since the last standstill, and solves them again.
 
-    Where no standstill is detected after the start, since the start.
+    Where no standstill is detected after the start, since the start. They go back for nine seconds
+    at most; where the start is longer ago, the first of these states is the prior, without images
+    of its own, which it knows.
 
     Attributes:
         done: whether the motion has been solved, or has taken too long.
     """
 
-    def __init__(self, context: EngineContext) -> None:
-        """Begin at rest.
+    def __init__(self, context: EngineContext, given: bool = False) -> None:
+        """Begin at rest, or with a state that is given.
 
         Args:
             context: shared with the engine.
+            given: whether the start was given: it may hover for long, and be far off by then.
         """
         self.done = False
-        # the noise is that of the engine, which has learned some of it since the start
+        self._longest_ns = round(1e9 * (LONGEST_HOVER_S if given else _LONGEST_S))
+        # the noise is that of the engine, which has learned some of it if images were used
         self._refinement = DynamicRefinement(
             context,
             _MAX_SCALE_SIGMA,
             white_noise_factor=1.0,
             hopeless=_HOPELESS_FACTOR,
-            patient=True,
+            patient=given,
         )
         self._states: list[NavState] = []
         self._frames: list[FeatureFrame] = []
@@ -113,7 +119,7 @@ class TakeOff:
         self._frames.append(frame)
         while state.stamp_ns - self._states[0].stamp_ns > _KEPT_NS:
             del self._states[0], self._frames[0]
-        self.done = self.elapsed_ns > round(_LONGEST_S * 1e9)
+        self.done = self.elapsed_ns > self._longest_ns
         few = len(frame.without(dynamic).cameras[0]) < MIN_FEATURES
         if self.done or few or state.stamp_ns < self._next_ns:
             return None
@@ -125,7 +131,10 @@ class TakeOff:
 
     def _solution(self, dynamic: IntArray) -> Window | None:
         """The window that begins with the last frame; None if the scale is not known yet."""
-        frames = self._thinned([frame.without(dynamic) for frame in self._frames])
+        static = [frame.without(dynamic) for frame in self._frames]
+        if self._states[0].stamp_ns > self._begun_ns:  # the first state knows its own images
+            static[0] = static[0].without(static[0].ids)
+        frames = self._thinned(static)
         chosen = set(frames.stamps_ns)
         states = [state for state in self._states if state.stamp_ns in chosen]
         ids, lengths = frames.tracks.lengths()
