@@ -139,6 +139,20 @@ def test_without_imu_there_is_no_evidence() -> None:
     assert said == [None] * len(stamps)
 
 
+def test_samples_that_have_ended_are_no_evidence() -> None:
+    """What is held of the last one does not change, though the platform moves."""
+    stamps_s = np.arange(0.0, 1.0, 0.005)
+    rng = np.random.default_rng(2)
+    gyro, accel = (rng.normal(0.0, sigma, (len(stamps_s), 3)) for sigma in (1.5, 4.0))
+    imu = ImuBuffer()
+    imu.add(ImuData(np.round(stamps_s * 1e9).astype(np.int64), gyro, accel))
+    seen = FeatureObservations(np.arange(20), np.ones((20, 2)), np.ones((20, 2)))
+    detector = StandstillDetector(CONFIG)
+    stamps = [round(t_s * 1e9) for t_s in np.arange(0.0, 4.0, 0.1).tolist()]
+    said = [detector.add_frame(imu, t, FeatureFrame(t, (seen,))) for t in stamps]
+    assert said == [None] * len(stamps)
+
+
 @pytest.mark.parametrize(("accel_mps2", "since_s"), [(0.0, 0.0), (0.2, 0.08), (0.1, 0.15)])
 def test_a_velocity_that_the_imu_has_gained_is_not_taken_for_zero(
     accel_mps2: float, since_s: float

@@ -36,7 +36,12 @@ from slam_graph.frontend.frontend_protocol import build_frontend
 from slam_graph.geometry.trajectory import NavState, Trajectory, interpolate
 from slam_graph.sensors import Rig
 from slam_graph.sensors.imu_buffer import ImuBuffer
-from slam_graph.sensors.measurements import CameraFrame, FeatureFrame, FeatureObservations
+from slam_graph.sensors.measurements import (
+    CameraFrame,
+    FeatureFrame,
+    FeatureObservations,
+    ImuData,
+)
 
 TIMES = np.linspace(0.0, 1.5, 11)
 MOTION = BackendConfig(initialization=InitializationConfig(mode="motion"))
@@ -247,6 +252,27 @@ def test_a_simulated_flight_starts_in_motion(cameras: int, seed: int) -> None:
     biases = np.concatenate([state.accel_bias, state.gyro_bias])
     error = biases - np.concatenate([flight.accel_bias, flight.gyro_bias])
     assert error @ np.linalg.solve(state.covariance[9:, 9:], error) < chi2.ppf(0.999, 6)
+
+
+@pytest.mark.parametrize("shift_ns", [-30_000_000_000, 1_800_000_000_000_000_000])
+def test_times_count_from_anywhere(shift_ns: int) -> None:
+    """A recorder may stamp by the time of day, or by the time since a trigger that came late."""
+    mounted, runs = rig(2), []
+    for shift in (0, shift_ns):
+        rng = np.random.default_rng(0)
+        estimator = Estimator(mounted, load_config().algorithm, MOTION)
+        states: list[NavState] = []
+        for packet in packets(Flight(), mounted, room(600, rng), 3.0, rng, 20.0):
+            assert isinstance(packet.frame, FeatureFrame)
+            imu, frame = packet.imu, packet.frame
+            estimator.add_imu(ImuData(imu.stamps_ns + shift, imu.gyro, imu.accel))
+            estimator.add_frame(FeatureFrame(frame.stamp_ns + shift, frame.cameras))
+            states += estimator.states
+        runs.append(states)
+    assert len(runs[0]) > 20
+    assert [s.stamp_ns for s in runs[1]] == [s.stamp_ns + shift_ns for s in runs[0]]
+    found, expected = (np.array([s.world_T_body.translation() for s in states]) for states in runs)
+    np.testing.assert_allclose(found, expected, atol=1e-5)
 
 
 def test_a_step_of_the_refinement_knows_its_cost(monkeypatch: pytest.MonkeyPatch) -> None:

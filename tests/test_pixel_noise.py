@@ -148,6 +148,29 @@ def test_each_camera_has_its_noise_within_bounds(tracks: Tracks) -> None:
     np.testing.assert_array_equal(learned(tracks, (0.5, 2.0), never), [1.0, 1.0])
 
 
+def test_a_camera_that_is_blind_for_a_day_keeps_what_it_has_shown(tracks: Tracks) -> None:
+    obs, truth, _ = tracks
+    config = NoiseConfig(adaptive_pixels="any")
+    noise = after(tracks, (0.5, 2.0), config)
+    before = noise.estimate_px
+    state = State()
+    for k, t_s in enumerate(np.linspace(0.0, 1.0, 20).tolist()):
+        state.insert_imu_state(k, Flight().nav_state(t_s, np.ones(5)))
+    cost = Cost(state, RigProjection(rig(CAMERAS)), BackendConfig(), SquareRootInformation.empty())
+    exact = obs.pixels - cost.rig.residuals(obs, truth)[0]
+    one = obs.camera == 0
+    pixels = exact + np.random.default_rng(7).normal(0.0, 0.5, exact.shape)
+    seen = Observations(
+        obs.ids, obs.frames, obs.feature[one], obs.frame[one], obs.camera[one], pixels[one],
+        obs.normalized[one],
+    )  # fmt: skip
+    features = TrackFeatures(seen, truth.points, np.zeros(len(obs.ids), np.bool_))
+    for hour in range(1, 25):
+        noise.learn(cost, features, hour * 3_600_000_000_000)
+    np.testing.assert_allclose(noise.estimate_px, [0.5, before[1]], rtol=0.1)
+    assert np.all(np.isfinite(noise.sigma_px))
+
+
 @pytest.mark.parametrize(("drift_px", "sigma_px"), [(0.01, 0.25), (0.1, 0.635), (0.2, 1.0)])
 def test_no_less_is_used_than_the_drift_of_a_window(
     tracks: Tracks, drift_px: float, sigma_px: float

@@ -61,11 +61,28 @@ def test_settings_of_tracks_are_accepted_where_some_are_used(features: str) -> N
 
 
 @pytest.mark.parametrize("features", ["every_step", "anew"])
-def test_features_that_stay_are_refused_where_all_their_observations_are_dropped(
-    features: str,
+@pytest.mark.parametrize("held", [0, 40])
+def test_features_that_stay_are_refused_where_their_observations_are_dropped(
+    features: str, held: int
 ) -> None:
     with pytest.raises(ValidationError, match=f"{features} makes a feature part of the prior"):
-        CostPolicy(past_poses="evenly_spaced", features=features, max_state_features=0)
+        CostPolicy(past_poses="evenly_spaced", features=features, max_state_features=held)
+
+
+@pytest.mark.parametrize("past_poses", ["most_recent", "evenly_spaced"])
+def test_no_more_poses_are_kept_than_are_allowed(past_poses: str) -> None:
+    window = Window(0, 0, State(), SquareRootInformation.empty())
+    policy = CostPolicy(past_poses=past_poses, max_past_poses=4, recent_frames=3)
+    select = {"most_recent": most_recent, "evenly_spaced": evenly_spaced}[past_poses]
+    for frame in range(40):
+        window.past.append(frame)
+        window.past_stamps_ns[frame] = frame * 10**9
+        window.past = select(window, policy, RigProjection(rig(2))).kept
+        assert len(window.past) <= 4
+    assert len(window.past) > 2
+    if past_poses == "evenly_spaced":
+        with pytest.raises(ValidationError, match="must be larger than recent_frames"):
+            CostPolicy(past_poses=past_poses, max_past_poses=4, recent_frames=4)
 
 
 @pytest.mark.parametrize("past_poses", ["most_recent", "evenly_spaced", "keyframes"])

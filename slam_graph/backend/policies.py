@@ -106,11 +106,11 @@ class CostPolicy(Settings):
                 f"features: {self.features} measures only features of the state, and "
                 "max_state_features: 0 allows none; raise it, or use features: once"
             )
-        if holds_none and features.relinearized and self.past_poses == "evenly_spaced":
+        if features.relinearized and self.past_poses == "evenly_spaced":
             raise ValueError(
                 f"features: {self.features} makes a feature part of the prior when a pose that saw "
-                "it leaves, and past_poses: evenly_spaced drops its observations, so none would "
-                "be; use most_recent or keyframes, or max_state_features above 0"
+                "it leaves, and past_poses: evenly_spaced drops its observations, so they would "
+                "be lost; use most_recent or keyframes, or features: once"
             )
         if holds_none:
             self._refuse(
@@ -133,6 +133,12 @@ class CostPolicy(Settings):
                 raise ValueError(
                     "past_poses: evenly_spaced keeps the oldest and the newest pose, so "
                     "max_past_poses must be 2 at least; or use most_recent"
+                )
+            if self.past_poses == "evenly_spaced" and self.recent_frames >= self.max_past_poses:
+                raise ValueError(
+                    f"past_poses: evenly_spaced keeps the {self.recent_frames} recent_frames and "
+                    f"the oldest pose, so max_past_poses: {self.max_past_poses} must be larger "
+                    "than recent_frames; or use most_recent"
                 )
             if self.recent_frames > self.max_past_poses + 1:
                 raise ValueError(

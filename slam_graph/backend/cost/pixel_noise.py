@@ -45,6 +45,8 @@ _MEMORY_S = 20.0
 """Time constant with which tracks are forgotten."""
 _PRIOR_DOF = 50.0
 """Degrees of freedom that the setting counts for at the start."""
+_LEAST_DOF = 1.0
+"""Degrees of freedom that the last estimate counts for, however long ago it was."""
 _QUANTILE = 0.95
 """Of the distribution of a track's sum, where the sum is cut off."""
 _WALK = _MIN_OBSERVATIONS / np.sqrt(3.0)
@@ -111,7 +113,8 @@ class PixelNoise:
             stamp_ns: time of the step.
         """
         self._steps += 1
-        kept = self._kept_since_last(stamp_ns)
+        # a camera that shows nothing for long keeps its last estimate, of little weight
+        kept = np.maximum(self._kept_since_last(stamp_ns), _LEAST_DOF / self._dof)
         self._dof, self._squares = kept * self._dof, kept * self._squares
         if tracks is None:
             return

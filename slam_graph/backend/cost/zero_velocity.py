@@ -60,6 +60,9 @@ each factor is taken for a measurement of its own."""
 _BRIDGE = 2.0
 """Largest value of a Brownian bridge of unit variance: exceeded with a probability of 7e-4."""
 
+_MAX_GAP = 0.25
+"""Longest part of the window without samples of the IMU: held ones would be those of rest."""
+
 _MAX_NOISE_PX = 3.0
 """Noisier tracks are wrong matches, and tell nothing."""
 
@@ -221,6 +224,8 @@ class StandstillDetector:
         the velocity that it gives is not zero.
         """
         if not imu.covers(start_ns):
+            return None
+        if imu.largest_gap_s(start_ns, stamp_ns) > _MAX_GAP * self._config.window_s:
             return None
         recent = imu.between(start_ns, stamp_ns)
         if np.max(np.std(recent.gyro, axis=0)) >= self._config.max_gyro_std:

@@ -83,7 +83,8 @@ class Initializer:
         self._refinement = DynamicRefinement(context, sigma)
         self._stamps_ns: list[int] = []
         self._frames: list[FeatureFrame] = []
-        self._tried_ns, self._in_vain = 0, 0
+        self._tried_ns: int | None = None
+        self._in_vain = 0
         self._rng = np.random.default_rng(0)
         self._standstill = StandstillDetector(
             context.config.zero_velocity, STATIC_DISPARITY_PX, enabled=True
@@ -148,7 +149,8 @@ class Initializer:
         self._forget(stamp_ns, length_ns)
         if not self._stamps_ns or stamp_ns - self._stamps_ns[0] < length_ns:
             return Refusal("frames", f"{length_s:g} s of frames with IMU samples")
-        if stamp_ns - self._tried_ns < round(self._retry_s() * 1e9):
+        tried_ns = self._tried_ns
+        if tried_ns is not None and stamp_ns - tried_ns < round(self._retry_s() * 1e9):
             return self._refusal
         self._tried_ns = stamp_ns
         outcome = self._attempt()

@@ -95,7 +95,9 @@ class StartCalibration:
         self.recent: deque[FeatureFrame] = deque()
         self._static: deque[FeatureFrame] = deque()  # the same without what is known to move
         self._turns = VisualTurns(self._camera, config.noise.pixel_sigma)
-        self._next_ns, self._pause_ns, self._doubted_ns = 0, _LATER_PAUSE_NS, 0
+        self._pause_ns = _LATER_PAUSE_NS
+        self._next_ns: int | None = None  # of the next comparison; None: at once
+        self._doubted_ns: int | None = None  # since when the clock seems to have changed
         self._checks = config.initialization.check_calibration
         self._monitor = ClockMonitor(self._camera) if self.mounted else None
         self.done = not self._checks and self.mounted
@@ -106,6 +108,7 @@ class StartCalibration:
         self._turns.forget()
         self.recent.clear()
         self._static.clear()
+        self._doubted_ns = None
 
     def add(
         self, frame: FeatureFrame, imu: ImuBuffer, started: bool, dynamic: IntArray
@@ -135,7 +138,7 @@ class StartCalibration:
         if self.done:
             return self._watch(frame, imu, monitor)
         self._turns.add(frame, imu, self.mounted, _SPACING_NS)
-        if frame.stamp_ns < self._next_ns:
+        if self._waits(frame):
             return None
         self._next_ns = frame.stamp_ns + _RETRY_NS
         covered = self._turns.covered(imu)
@@ -151,17 +154,22 @@ class StartCalibration:
             return change
         if self._monitor is not None and self._monitor.confirms_calibration(found):
             # the clock has changed since, which is said once there is a state
-            self._doubted_ns = self._doubted_ns or frame.stamp_ns
+            if self._doubted_ns is None:
+                self._doubted_ns = frame.stamp_ns
             if started or frame.stamp_ns - self._doubted_ns < _WAIT_NS:
                 return None
         return self._judged(found, _ADOPTED_SIGMA_S if started else _WAITING_SIGMA_S)
+
+    def _waits(self, frame: FeatureFrame) -> bool:
+        """Whether the next comparison is later than a frame."""
+        return self._next_ns is not None and frame.stamp_ns < self._next_ns
 
     def _watch(
         self, frame: FeatureFrame, imu: ImuBuffer, monitor: ClockMonitor | None
     ) -> ClockChange | None:
         """A change of the clock since the start; few rotations tell whether to estimate it."""
         self._turns.add(frame, imu, self.mounted, _LATER_SPACING_NS, keep_last=True)
-        if monitor is None or frame.stamp_ns < self._next_ns:
+        if monitor is None or self._waits(frame):
             return None
         self._next_ns = frame.stamp_ns + _LATER_RETRY_NS
         covered = self._turns.covered(imu, _LATER_TURNS)
