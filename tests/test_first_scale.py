@@ -54,10 +54,18 @@ def test_it_is_the_way_that_must_be_known_and_not_the_place(sigma: float, wait: 
 
 
 def test_images_that_are_used_once_are_used_from_then_on() -> None:
-    window = window_of([0.6, 0.8, 0.0])
-    assert images_wait(window, window.state, known_to(1.2))
-    assert not images_wait(window, window.state, known_to(0.8))
-    assert not images_wait(window, window.state, known_to(1.2))
+    sequence = sg.simulate(duration_s=3.0, rate_hz=10, cameras=1, tracks={"features": 40})
+    told, waits = sg.load_config("msckf"), []
+    estimator = sg.Estimator(sequence.rig, told.algorithm, told.backend)
+    estimator.start(sequence.initial_state())
+    for packet in sequence.packets():
+        estimator.add_imu(packet.imu)
+        estimator.add_frame(packet.frame)
+        assert estimator.window is not None
+        waits.append(estimator.window.images_wait_until_ns is not None)
+    assert waits[0]
+    assert not waits[-1]
+    assert waits == sorted(waits, reverse=True)
 
 
 def test_they_do_not_wait_for_ever() -> None:

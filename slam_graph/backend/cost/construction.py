@@ -69,6 +69,7 @@ class ConstructedCost:
         remaining: the part of its cost that no values of the variables can remove.
         innovations: distances of the images from that.
         offered: the new features before the gate, without those that will come again.
+        uses_images: whether features were looked for, so that images no longer wait.
     """
 
     cost: Cost
@@ -84,6 +85,7 @@ class ConstructedCost:
     remaining: float = 0.0
     innovations: Innovations = field(default_factory=Innovations)
     offered: TrackFeatures | None = None
+    uses_images: bool = False
 
     def innovations_under(self, posterior: SquareRootInformation) -> Innovations:
         """The innovations with the joint distance of all measurements that entered.
@@ -160,7 +162,8 @@ class CostConstruction:
         predicted = cost.prior_at_estimate().updated(rows, overwrite=True, overwrite_rows=True)
         in_state = self._measured_again(window, cost.state)
         cost.landmarks = window.tracks.observations(in_state)
-        if not images_wait(window, cost.state, predicted):
+        uses_images = not images_wait(window, cost.state, predicted)
+        if uses_images:
             cost.tracks = self._selection.new_features(
                 window, cost.state, poses, len(in_state), self._dynamic, removals
             )
@@ -179,7 +182,7 @@ class CostConstruction:
             seen = seen_by_leaving(window.tracks, window.past, poses)
             constructed.loses_pose = is_in(cost.tracks.obs.ids, seen)
             constructed.absorbed = self._absorbed(cost.tracks, constructed.loses_pose)
-        constructed.linear = linear
+        constructed.linear, constructed.uses_images = linear, uses_images
         constructed.predicted, constructed.remaining = predicted, predicted.residual
         if offered is not None:  # those that go on waiting come again
             waiting = cost.ids_of(~constructed.absorbed)

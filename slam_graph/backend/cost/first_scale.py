@@ -26,7 +26,7 @@ it must."""
 
 
 def images_wait(window: Window, state: State, predicted: SquareRootInformation) -> bool:
-    """Whether the images of the current frame are left out; once they are used, it stays so.
+    """Whether the images of the current frame are left out.
 
     Args:
         window: with the current frame, and how long images wait at most.
@@ -34,12 +34,9 @@ def images_wait(window: Window, state: State, predicted: SquareRootInformation) 
         predicted: what is known of them without its images.
     """
     until_ns = window.images_wait_until_ns
-    if until_ns is None:
+    if until_ns is None or window.stamp_ns >= until_ns:
         return False
-    if window.stamp_ns < until_ns and not _way_is_known(window, state, predicted):
-        return True
-    window.images_wait_until_ns = None
-    return False
+    return not _way_is_known(window, state, predicted)
 
 
 def _way_is_known(window: Window, state: State, predicted: SquareRootInformation) -> bool:

@@ -27,7 +27,7 @@ from slam_graph.backend.cost.adaptive_imu_noise import (
 )
 from slam_graph.backend.cost.vibration_covariance import VibrationCovariance
 from slam_graph.backend.cost.zero_velocity import zero_velocity_factors
-from slam_graph.backend.solve.state import State
+from slam_graph.backend.solve.state import State, dims_of
 from slam_graph.backend.window import Window
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.geometry import NavState
@@ -74,6 +74,26 @@ class _Transition:
         """The covariance (15, 15) of the later state from that of the earlier one."""
         F, N = self.matrix, self.noise
         return np.asarray(F @ covariance @ F.T + N @ N.T, dtype=np.float64)
+
+
+def _known_of(window: Window) -> FloatArray | None:
+    """Covariance (6, 6) of the newest pose by the prior and the factors that are not part of it yet.
+
+    After a beginning no state was reported from which it could be predicted. None where they leave
+    the pose undetermined.
+    """
+    keys = {key for factor in window.factors for key in factor.keys()}
+    known = window.prior.extended(dims_of(sorted(keys - window.prior.layout.dims.keys())))
+    for factor in window.factors:
+        jacobian = gtsam.JacobianFactor(factor.linearize(window.state.first_frames))
+        A, _ = jacobian.jacobian()
+        rows = np.zeros((len(A), known.layout.size + 1))
+        rows[:, known.layout.indices(jacobian.keys())] = A
+        known = known.updated(rows)
+    try:
+        return known.covariance_of([int(X(window.frame))])
+    except np.linalg.LinAlgError:
+        return None
 
 
 def imu_factor(
@@ -209,9 +229,12 @@ class Propagation:
         self, aiding: Aiding, window: Window, frames: tuple[int, int], stamps_ns: tuple[int, int]
     ) -> None:
         """Append what fixes and odometry say of the motion to the new frame."""
-        known = self._predicted or self._last
-        covariance = None if known is None or known.covariance is None else known.covariance[:6, :6]
-        window.factors += aiding.factors(window.state, frames, stamps_ns, covariance, window.prior)
+        predicted = self._predicted
+        if predicted is not None and predicted.covariance is not None:
+            known = predicted.covariance[:6, :6]
+        else:
+            known = _known_of(window)
+        window.factors += aiding.factors(window.state, frames, stamps_ns, known, window.prior)
 
     def _predict_covariance(
         self, predicted: NavState, factor: gtsam.CombinedImuFactor, window: Window

@@ -135,6 +135,8 @@ def marginalize_step(
     window.past, window.moving = list(kept), list(constructed.moving)
     window.past_stamps_ns = {i: window.past_stamps_ns[i] for i in kept}
     window.keyframes = set(constructed.poses.keyframes)
+    if constructed.uses_images:
+        window.images_wait_until_ns = None
     _keep_points(window, constructed)
     _settle_observations(window, constructed)
 
