@@ -56,7 +56,8 @@ TEN_THAT_MATTER = (
     ),
     Advice(
         "backend.noise.pixel_sigma",
-        "The NIS in `metrics.json` is far from 1, or many features are rejected by the gate.",
+        "In `metrics.json` `nis.mean` is far above `nis.expected_mean`, or many features are "
+        "rejected by the gate.",
         "A larger value trusts images less and rejects fewer features; covariances grow.",
     ),
     Advice(

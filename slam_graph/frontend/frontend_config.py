@@ -147,7 +147,7 @@ class FrontendConfig(Settings):
     """Side of the window that Lucas-Kanade tracks; 17 is tracked by a kernel, others by OpenCV."""
 
     pyramid_levels: int = expert(3, ge=0, le=8)
-    """Halvings of the image: 3 means four levels, from full to one eighth of the resolution."""
+    """Pyramid levels above the image: 3 of them have half, a quarter and an eighth of its size."""
 
     forward_backward_px: float = expert(0.5, gt=0.0)
     """Largest distance between a point and itself after tracking it forward and back."""
