@@ -50,8 +50,8 @@ def compare(
     Tasks that were done by an earlier call with the same settings and `output` are not repeated.
 
     Args:
-        data: one or more of: path of a recording, `demo`, `sim:figure8`, `sim:rooms`, `sim:random`, `sim:car`,
-            or `sim:PATH` of a recorded flight with its IMU.
+        data: one or more of: path of a recording, `demo`, `sim:figure8`, `sim:rooms`, `sim:random`,
+            `sim:car`, or `sim:PATH` of a recorded flight with its IMU.
         algorithms: names or paths of YAML files; a text may hold several with commas between.
         seeds: their number, for 0, 1, …, or the seeds themselves.
         output: folder of tracks, results and report.
