@@ -3,6 +3,7 @@
 """Result files: whole or absent, read back as written, and a `latest` link that always works."""
 
 import csv
+import io
 import json
 import logging
 from datetime import UTC, datetime
@@ -33,6 +34,7 @@ from slam_graph.results.run_input import RunInput
 from slam_graph.results.run_logs import TimingLog
 from slam_graph.results.run_result import RunResult
 from slam_graph.results.saved_run import load_result
+from slam_graph.results.segments import Segment, Segments
 from slam_graph.sensors.measurements import FeatureFrame, FeatureObservations
 from slam_graph.sensors.rig import Rig
 
@@ -155,6 +157,35 @@ def test_frame_table_has_a_cost_for_each_step_that_was_ever_taken() -> None:
     assert "cost_after_2" not in rows[0]
     assert [row["tracked"] for row in rows] == ["0"] * 4
     assert [row["nis"] for row in rows] == ["2", "2", "", ""]
+
+
+@pytest.mark.parametrize("level", [True, False])
+def test_cells_of_segments_are_under_their_names(level: bool) -> None:
+    """Without an IMU the joint has three rotations; yaw is the one about the vertical."""
+    turns = [0.3] if level else [0.1, 0.2, 0.3]
+    segments = Segments()
+    segments.add(0)
+    segments.end(10, "lost, as said")
+    segments.add(20, np.diag(np.square([1.0, 2.0, 3.0, *turns])), joined=True)
+    segments.add(30)
+    segments[1].loops = 7
+    poses = np.zeros((3, 3)), np.tile([0.0, 0.0, 0.0, 1.0], (3, 1))
+    lines = segments.csv_lines(Trajectory(np.array([0, 20, 30]), *poses))
+    first, second = csv.DictReader(io.StringIO("".join(lines)))
+    assert all(None not in row and None not in row.values() for row in (first, second))
+    assert (first["states"], first["sigma_yaw_rad"]) == ("1", "0")
+    assert first["ended_by"] == "lost, as said"
+    names = "sigma_x_m", "sigma_y_m", "sigma_z_m", "sigma_yaw_rad", "loops", "ended_by"
+    assert [second[name] for name in names] == ["1", "2", "3", "0.3", "7", ""]
+    others = [second[f"sigma_about_{axis}_rad"] for axis in "xy"]
+    assert others == (["", ""] if level else ["0.1", "0.2"])
+    assert second["joint_first_ns"] == second["joint_cov_55"] == ""
+    assert segments[1].joint_sigmas == pytest.approx((0.3, 3.0))
+
+
+def test_a_joint_is_as_unknown_as_its_worst_rotation() -> None:
+    joint = np.diag(np.square([1.0, 2.0, 3.0, 0.1, 0.4, 0.3]))
+    assert Segment(0, 1, "none", joint).joint_sigmas == pytest.approx((0.4, 3.0))
 
 
 def test_growing_table_is_what_one_array_would_be() -> None:

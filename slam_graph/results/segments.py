@@ -27,6 +27,7 @@ _COLUMNS = (
     *("joint_first_ns", "joint_second_ns"),
     *(f"joint_{name}" for name in ("x", "y", "z", "qx", "qy", "qz", "qw")),
     *(f"joint_cov_{i}{j}" for i in range(6) for j in range(i, 6)),
+    *("sigma_about_x_rad", "sigma_about_y_rad"),
 )
 _OF_PLACES = 2 + 7 + 21
 """Columns of the joint by places."""
@@ -66,7 +67,9 @@ class Segment:
     Attributes:
         begin_ns, end_ns: times of its first and its last state.
         joined_by: what puts it into the world of the segment before.
-        joint_covariance: (4, 4) of that: position (m) in axes of the world, and yaw (rad).
+        joint_covariance: (4, 4) of that: position (m) in axes of the world, and yaw (rad). Without
+            an IMU nothing tells where is up, and it is (6, 6): position, then rotation (rad) about
+            the axes x, y, z of the world, of which the last is yaw.
         loops: number of accepted loop closures to earlier segments, if loops were closed.
         place_joint: how these join it to the segment before; None without them.
         ended_by: what ended it; empty for the end of the recording.
@@ -82,9 +85,12 @@ class Segment:
 
     @property
     def joint_sigmas(self) -> tuple[float, float]:
-        """Standard deviations of the joint: yaw (rad), and position (m) along the worst axis."""
+        """Standard deviations of the joint: rotation (rad), then position (m), of the worst axis.
+
+        With an IMU the rotation is yaw.
+        """
         variances = np.diag(self.joint_covariance)
-        return float(np.sqrt(variances[3])), float(np.sqrt(variances[:3].max()))
+        return float(np.sqrt(variances[3:].max())), float(np.sqrt(variances[:3].max()))
 
     @property
     def seconds(self) -> float:
@@ -149,7 +155,8 @@ class Segments:
 
         Args:
             stamp_ns: its time.
-            joint: (4, 4) covariance of the joint, if a segment begins that is not the first.
+            joint: (4, 4) or (6, 6) covariance of the joint, see `Segment`, if a segment begins
+                that is not the first.
             joined: whether the joint holds.
         """
         if not self.goes_on:
@@ -201,15 +208,16 @@ class Segments:
         world = -1
         for number, segment in enumerate(self._all):
             world += segment.joined_by == "none" or number == 0
-            sigmas = np.sqrt(np.diag(segment.joint_covariance))
+            sigmas = [f"{sigma:.6g}" for sigma in np.sqrt(np.diag(segment.joint_covariance))]
             cells = [
                 *(str(number), str(world), str(segment.begin_ns), str(segment.end_ns)),
                 str(len(segment.part_of(trajectory))),
                 segment.joined_by,
-                *(f"{sigma:.6g}" for sigma in sigmas),
+                *(*sigmas[:3], sigmas[-1]),  # yaw is the last rotation, if not the only one
                 str(segment.loops),
                 '"{}"'.format(segment.ended_by.replace('"', "'")),
                 *_joint_cells(segment.place_joint),
+                *(sigmas[3:-1] or ["", ""]),
             ]
             yield ",".join(cells) + "\n"
 

@@ -56,7 +56,10 @@ _REVISED_M, _REVISED_NS = 0.01, 1_500_000_000
 """A step that moves the body by more than this (m) through lever arm and clock; images are not
 compared with the motion for this long (ns) after it."""
 _HISTORY_NS = 5_000_000_000
-"""How long odometry and states are kept."""
+"""How long states are kept, for fixes that come late."""
+_RECEIVED_NS = 10_000_000_000
+"""How long what was received is kept, as the samples of the IMU are: frames since then may be taken
+again."""
 
 
 class Aiding:
@@ -82,7 +85,7 @@ class Aiding:
         variables = FixVariables(config.gnss)
         self.variables = variables if calibrates and variables.keys else None
         self.lever_arm_m = np.array(config.gnss.lever_arm_m)
-        self._data = AidingData.empty()
+        self._data = AidingData.empty()  # by the given offsets of time alone
         self.gates: defaultdict[str, FixGate] = defaultdict(FixGate)
         self.used, self.offset_s, self._offset_sigma_s = False, 0.0, 0.0
         self._shifted_s = 0.0  # added to the times of fixes that wait
@@ -95,20 +98,44 @@ class Aiding:
         return np.append(self.offset_s, self.lever_arm_m)
 
     def restart(self) -> None:
-        """The estimate begins anew, in another world."""
+        """The estimate begins anew, in another world.
+
+        It may begin with frames that were taken before: what was received of the last seconds waits
+        again. What is older than the first state finds no place on its path.
+        """
         self.aligned = False
         self._path = EstimatedPath()
-        self._waiting = self._offered = AidingData.empty()
+        self._shifted_s = self.offset_s
+        self._waiting, self._offered = self._shifted(self._data), AidingData.empty()
         self._offered_ns = 0
         self._fixes: list[Fix] = []
-        self._shifted_s = self.offset_s
+        for gate in self.gates.values():
+            gate.restart()
 
     def add(self, data: AidingData) -> None:
-        """Take measurements that follow those before; none say that there will be some."""
+        """Take measurements that follow those before; none say that there will be some.
+
+        They come with the frames: until there is a state, what is much older than they are goes.
+        """
         self.used = True
-        data = self._config.on_the_clock(data).shifted(round(self._shifted_s * 1e9))
+        data = self._config.on_the_clock(data)
+        if not self._path.states:
+            self._forget_before(data)
         self._data = AidingData.concatenate([self._data, data])
-        self._waiting = AidingData.concatenate([self._waiting, data])
+        self._waiting = AidingData.concatenate([self._waiting, self._shifted(data)])
+
+    def _forget_before(self, data: AidingData) -> None:
+        """Forget what no frame will ask for any more when some measurements come."""
+        kinds = data.fix_stamps_ns, data.pose_stamps_ns, data.odometry_stamps_ns
+        begins_ns = [int(stamps_ns[0]) for stamps_ns in kinds if len(stamps_ns)]
+        if begins_ns:
+            oldest_ns = min(begins_ns) - _RECEIVED_NS
+            self._data = self._data.within(oldest_ns, None)
+            self._waiting = self._waiting.within(oldest_ns, None)
+
+    def _shifted(self, data: AidingData) -> AidingData:
+        """Measurements with the time offset that those that wait have."""
+        return data.shifted(round(self._shifted_s * 1e9))
 
     # --- factors ---------------------------------------------------------------------------------
 
@@ -129,7 +156,7 @@ class Aiding:
             known: (6, 6) covariance of the new pose as it is predicted; None if it is not known.
             prior: on the variables up to the last frame, if lever arm or clock are among them.
         """
-        self._data = self._data.within(stamps_ns[0] - _HISTORY_NS, None)
+        self._data = self._data.within(stamps_ns[0] - _RECEIVED_NS, None)
         first, last = (state.frames.atPose3(pose_key(i)) for i in frames)
         factors: list[gtsam.NonlinearFactor] = []
         if self._config.odometry.enabled:

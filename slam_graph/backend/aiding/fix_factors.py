@@ -176,6 +176,10 @@ class FixGate:
         self.tested = self.rejected = 0
         self._recent: deque[bool] = deque(maxlen=_REMEMBERED)
 
+    def restart(self) -> None:
+        """The estimate begins anew: the last fixes say nothing of it. What was counted stays."""
+        self._recent.clear()
+
     def weight(self, fix: Fix, pose: gtsam.Pose3, known: FloatArray) -> float:
         """Factor on the information of a fix, from 0 to 1.
 

@@ -46,8 +46,6 @@ def regauged(
     """
     motion, covariance, centre = found.motion, found.covariance, found.centre
     there = moved(window, motion)
-    rotation = motion.rotation().matrix()
-    ids, points = window.kept_points
     prior = there.prior
     N = gauge_directions(there.state.first, prior.layout, centre, level=len(covariance) == 4)
     store = LandmarkStore()
@@ -60,7 +58,6 @@ def regauged(
         there,
         prior=with_free_gauge(prior, N, covariance, keys),
         calibration=(*window.calibration, *keys),
-        kept_points=(ids, points @ rotation.T + motion.translation()),
         lost_features=store,
     )
 

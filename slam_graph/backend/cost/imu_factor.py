@@ -77,12 +77,12 @@ class _Transition:
 
 
 def _known_of(window: Window) -> FloatArray | None:
-    """Covariance (6, 6) of the newest pose by the prior and the factors that are not part of it yet.
+    """Covariance (6, 6) of the newest pose by the prior and the factors that are not in it yet.
 
     After a beginning no state was reported from which it could be predicted. None where they leave
     the pose undetermined.
     """
-    keys = {key for factor in window.factors for key in factor.keys()}
+    keys = {key for of_factor in map(gtsam.Factor.keys, window.factors) for key in of_factor}
     known = window.prior.extended(dims_of(sorted(keys - window.prior.layout.dims.keys())))
     for factor in window.factors:
         jacobian = gtsam.JacobianFactor(factor.linearize(window.state.first_frames))
@@ -230,10 +230,8 @@ class Propagation:
     ) -> None:
         """Append what fixes and odometry say of the motion to the new frame."""
         predicted = self._predicted
-        if predicted is not None and predicted.covariance is not None:
-            known = predicted.covariance[:6, :6]
-        else:
-            known = _known_of(window)
+        known = None if predicted is None or predicted.covariance is None else predicted.covariance
+        known = _known_of(window) if known is None else known[:6, :6]
         window.factors += aiding.factors(window.state, frames, stamps_ns, known, window.prior)
 
     def _predict_covariance(

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import gtsam
 import numpy as np
 
-from slam_graph.arrays import FloatArray
+from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.backend.engine_protocol import EngineContext
 from slam_graph.backend.initialization.start_review import contradict
 from slam_graph.backend.solve.square_root import SquareRootInformation, triangularize
@@ -87,19 +87,27 @@ def place(
 
 
 def moved(window: Window, motion: gtsam.Pose3) -> Window:
-    """A window that has just begun, in a world that is moved.
+    """A window in a world that is moved: one that has just begun, or a running one between steps.
 
     Args:
-        window: without factors and tracks that are not in its prior yet.
-        motion: new_T_old of the two worlds; with an IMU a rotation about the vertical.
+        window: with no factor of where it is in the world: dynamics, standstill and odometry are
+            the same in every world, fixes are not. Waiting observations are in images. Features in
+            `lost_features` stay in the world before.
+        motion: new_T_old of the two worlds; with an IMU position and a rotation about the vertical,
+            as gravity, which the dynamics have, stays.
     """
     rotation = motion.rotation().matrix()
-    ids, points = window.last_points
+
+    def there(known: tuple[IntArray, FloatArray]) -> tuple[IntArray, FloatArray]:
+        ids, points = known
+        return ids, points @ rotation.T + motion.translation()
+
     return replace(
         window,
         state=window.state.moved(motion),
         prior=_turned(window.prior, rotation),
-        last_points=(ids, points @ rotation.T + motion.translation()),
+        kept_points=there(window.kept_points),
+        last_points=there(window.last_points),
     )
 
 
