@@ -21,7 +21,8 @@ from slam_graph.errors import DataError
 from slam_graph.experiment.tasks import RecordTask, find_sources
 from slam_graph.frontend import FrontendConfig, build_frontend
 from slam_graph.pipeline import run
-from slam_graph.results import RunResult
+from slam_graph.pipeline.tracking import packets_of
+from slam_graph.results import RunInput, RunResult
 from slam_graph.sensors import FeatureFrame, FeatureObservations, ImuData
 from slam_graph.simulation.simulated_sequence import SimulatedSequence
 from slam_graph.simulation.simulator import euroc_rig, simulate
@@ -182,6 +183,21 @@ def test_what_moves_is_replayed_only_where_it_is_wanted() -> None:
 
 
 # --- runs ----------------------------------------------------------------------------------------
+
+
+def test_an_open_recording_is_run_with_fewer_cameras(recorded: Path) -> None:
+    """What moves is left out with the cameras that are; a frame with no more cameras is kept."""
+    recording = open_dataset(recorded)
+    result = run(recording, cameras="mono", overrides={"objects.enabled": True})
+    assert result.status == "not_initialized", result.message
+    info, config = recording.info(), load_config()
+    for count in (1, 2):
+        rig = recording.rig.select(count)
+        asked = RunInput(info, config, rig, info.start_ns, info.end_ns)
+        for packet, said in zip(packets_of(recording, asked), frames(), strict=True):
+            assert isinstance(packet.frame, FeatureFrame)
+            assert len(packet.frame.cameras) == count
+            assert packet.frame.whole.cameras[0].ids.tolist() == said.whole.cameras[0].ids.tolist()
 
 
 def estimated(

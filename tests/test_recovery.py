@@ -323,6 +323,7 @@ def test_a_window_in_a_moved_world_knows_the_same() -> None:
     state.freeze(layout.dims)
     state.update(layout, 0.1 * rng.normal(size=layout.size))
     window = Window(0, 0, state, SquareRootInformation(layout, np.asfortranarray(Rd)))
+    window.kept_points = window.last_points = np.array([9]), rng.normal(size=(1, 3))
     motion = gtsam.Pose3(gtsam.Rot3.Yaw(1.0), np.array([3.0, -2.0, 1.0]))
     other = moved(window, motion)
 
@@ -340,6 +341,10 @@ def test_a_window_in_a_moved_world_knows_the_same() -> None:
         for w in (window, other)
     ]
     np.testing.assert_allclose(seen[0], seen[1], atol=1e-12)
+    for ids, points in (other.kept_points, other.last_points):
+        assert ids.tolist() == [9]
+        there = motion.transformFrom(window.kept_points[1][0])
+        np.testing.assert_allclose(points, [there], atol=1e-12)
     costs = [
         float(np.sum((w.prior.R @ w.state.offset(layout) - w.prior.d) ** 2))
         for w in (window, other)

@@ -10,12 +10,14 @@ from pathlib import Path
 import gtsam
 import numpy as np
 import pytest
+from estimating import from_given_state
 
 from slam_graph.backend import Estimator
 from slam_graph.backend.cost.adaptive_imu_noise import DynamicsNoise
 from slam_graph.backend.initialization import start_review
 from slam_graph.backend.initialization.start_review import StartReview, contradict
 from slam_graph.backend.initialization.take_off import TakeOff
+from slam_graph.backend.window import Window
 from slam_graph.config import load_config
 from slam_graph.evaluation import ape
 from slam_graph.geometry import NavState, StateHistory
@@ -113,6 +115,29 @@ def test_the_run_goes_on_from_the_new_solution(monkeypatch: pytest.MonkeyPatch) 
     error = ape(sequence.groundtruth(), history.trajectory(), alignment="se3")
     assert error.statistics.rmse < 0.05
     assert np.max(history.sigmas()[:, 6:9]) < 0.1
+
+
+def test_what_moves_is_known_after_a_review_unless_only_the_start_said_so(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A feature that did not fit a wrong start may be static."""
+    sequence = simulate(trajectory="figure8", duration_s=1.0, seed=5, rate_hz=10.0)
+    *_, estimator = from_given_state(sequence, "msckf")
+    window, start_up = estimator.window, estimator._start_up
+    assert window is not None
+
+    def corrected(*_: object) -> Window:
+        start_up.outliers, start_up.contradicted = np.array([4, 8]), True
+        return window
+
+    start_up.outliers, start_up.doubtful = np.array([2]), True
+    estimator.exclude(np.array([2, 4, 6]))
+    monkeypatch.setattr(start_up, "better", corrected)
+    (*_, packet) = sequence.packets()
+    assert isinstance(packet.frame, FeatureFrame)
+    state = estimator._reviewed(packet.frame, window.current(window.prior), False)
+    assert estimator.replayed == [state]
+    assert estimator.dynamic.tolist() == [4, 6, 8]
 
 
 @pytest.mark.slow

@@ -11,11 +11,11 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable
-from typing import TypeAlias
+from typing import ClassVar, TypeAlias
 
 import numpy as np
 
-from slam_graph.arrays import IntArray
+from slam_graph.arrays import IntArray, ascending_union
 from slam_graph.backend.aiding.aiding_factors import Aiding
 from slam_graph.backend.aiding.regauging import regauged
 from slam_graph.backend.backend_config import BackendConfig
@@ -45,8 +45,6 @@ from slam_graph.sensors import FeatureFrame, ImuBuffer, ImuData, Rig
 
 _HISTORY_NS, _MAX_AHEAD_NS = 10_000_000_000, 10_000_000_000
 """How long IMU samples are kept, and how much later than the last sample a frame may be."""
-_LEAD_NS = 1_000_000_000
-"""A given state may be this much older than the first frame after a new beginning."""
 _ROUNDS, _REPEATED_S = 3, 1e-3
 """Most beginnings with a corrected time offset; another is made if its estimate moved by more."""
 
@@ -66,9 +64,11 @@ class Estimator(EstimatorKnowledge):
         aiding: takes position fixes and odometry up to the next frame.
         clock_change: found at the last frame: the state is wrong since then; see `begin_segment`.
         clock_changes: those that are corrected in the IMU samples.
+        LEAD_NS: a given state may be so much older than the first frame: the IMU reaches so far.
     """
 
     ClockChanges: TypeAlias = clock_change.ClockChanges
+    LEAD_NS: ClassVar[int] = 1_000_000_000
 
     def __init__(
         self,
@@ -88,7 +88,7 @@ class Estimator(EstimatorKnowledge):
         Raises:
             ConfigError: if the engine cannot do what the settings ask for.
         """
-        config, diagnostics = config or BackendConfig(), diagnostics or Diagnostics()
+        config, self.diagnostics = config or BackendConfig(), diagnostics or Diagnostics()
         self._real_rig = rig
         self.clock_change: clock_change.ClockChange | None = None
         self.clock_changes = clock_change.ClockChanges()
@@ -104,11 +104,9 @@ class Estimator(EstimatorKnowledge):
         self._held: deque[FeatureFrame] | None = None
         self._measured, self._corrected = True, False
         self._output_ns = self.solved_ns = np.iinfo(np.int64).min
-        self.report = StepReport()
-        self._single_thread = SingleThread()
+        self.report, self._single_thread = StepReport(), SingleThread()
         self.rig, self.algorithm, self.config = rig, algorithm, config
         self._variables, self._start_mode = config.calibration, config.initialization.mode
-        self.diagnostics = diagnostics
         self.replayed: list[NavState] | None = None
         self.states: list[NavState] = []
         self._begin(ImuBuffer())
@@ -122,14 +120,12 @@ class Estimator(EstimatorKnowledge):
         context = EngineContext(
             rig, self.algorithm, config, diagnostics, calibration, projection, propagation, imu
         )
-        self._engine: Engine = self._make_engine(context)
-        self._context = context
+        self._context, self._engine = context, self._make_engine(context)
         self._start_up = StartUp(context, self._start_mode, self._before, self._measured)
         propagation.aiding = self.aiding
         self.aiding.restart()
         self._standstill = StandstillDetector(config.zero_velocity)
-        self._latest_ns = np.iinfo(np.int64).min
-        self.window: Window | None = None
+        self._latest_ns, self.window = np.iinfo(np.int64).min, None
 
     # --- input -----------------------------------------------------------------------------------
 
@@ -170,16 +166,15 @@ class Estimator(EstimatorKnowledge):
         self._given, self._start_mode = None, "auto"
         self._before, self._measured = before, measured
         change, self.clock_change = self.clock_change, None
-        recent, held, imu = list(self._check.recent), self._held or (), self._context.imu
-        frames: list[FeatureFrame] = []
+        held, imu = self._held or (), self._context.imu
+        frames = [] if change is None else [*change.after(self._check.recent), *held]
         self._check.forget()
         if change is not None:
-            frames = [*change.after(recent), *held]
             self.clock_changes = self.clock_changes.and_then(change)
             imu.data = change.corrected(imu.data)
         if change is not None or self._held is not None:
             self._held = deque(frames)
-        self.states, self.replayed = [], None
+        self.states, self.replayed, self.report = [], None, StepReport()
         with self._single_thread.held():
             self._begin(imu)
             if frames:
@@ -189,8 +184,7 @@ class Estimator(EstimatorKnowledge):
         """Add IMU samples that follow those already given; others are counted and left out."""
         if not self.rig.has_imu:  # they mean nothing
             return
-        left_out = self._context.imu.add(self.clock_changes.corrected(imu))
-        if left_out:
+        if left_out := self._context.imu.add(self.clock_changes.corrected(imu)):
             message = f"{left_out} IMU samples are not finite or not in order"
             self.diagnostics.warn("imu_rejected", message)
 
@@ -199,7 +193,7 @@ class Estimator(EstimatorKnowledge):
         self._context.imu.add(known)
 
     def assume_pixel_noise(self, sigma_px: float) -> None:
-        """Take observations for so noisy from now on, unless their noise is estimated."""
+        """Take observations for so noisy, unless that is estimated; GTSAM's smoothers ignore it."""
         self._context.pixels.assume(sigma_px)
 
     def add_frame(self, frame: FeatureFrame) -> NavState | None:
@@ -216,7 +210,7 @@ class Estimator(EstimatorKnowledge):
             has all that were found.
         """
         with self._single_thread.held():
-            self.replayed, self.clock_change = None, None
+            self.replayed, self.clock_change, self.report = None, None, StepReport()
             if self._held is None:
                 state = self._take(frame)
                 if self.replayed is None:
@@ -248,8 +242,7 @@ class Estimator(EstimatorKnowledge):
 
     def _solve(self, frame: FeatureFrame) -> NavState | None:
         """Estimate the state at a frame."""
-        self.report = StepReport()
-        self.solved_ns = frame.stamp_ns
+        self.report, self.solved_ns = StepReport(), frame.stamp_ns
         imu, calibration = self._context.imu, self._context.calibration
         self._dynamics.extend(imu, frame.stamp_ns + round(self.rig.end_offset_s * 1e9))
         state = self.window.state if self.window is not None else None
@@ -289,7 +282,7 @@ class Estimator(EstimatorKnowledge):
         if self.algorithm.engine == "square_root":  # GTSAM's smoothers take it as it is
             self._variables = found.variables
         given, frames = self._given, [*self._check.recent, *(self._held or ())]
-        if given is not None and given.stamp_ns < frames[0].stamp_ns - _LEAD_NS:
+        if given is not None and given.stamp_ns < frames[0].stamp_ns - self.LEAD_NS:
             # the IMU alone would have to lead from there to here
             given, self._given, self._start_mode = None, None, "auto"
         if self.window is not None:
@@ -351,11 +344,13 @@ class Estimator(EstimatorKnowledge):
         """The state, or that of a new window if what followed the start leads to one."""
         if not self._start_up.doubtful:
             return state
+        # they move, all but those that did not fit the start: it may be what was wrong
+        known = np.setdiff1d(self._standstill.dynamic, self._start_up.outliers)
         with self.report.timed("start"):
             window = self._start_up.better(frame, self._standstill.dynamic, state, still)
         if window is None:
             return state
-        self._standstill.dynamic = self._start_up.outliers
+        self._standstill.dynamic = ascending_union(known, self._start_up.outliers)
         self.window, self._engine = window, self._make_engine(self._context)
         self._context.propagation.restart()
         state = window.current(window.prior)
@@ -371,6 +366,11 @@ class Estimator(EstimatorKnowledge):
             self.window.tracks.remove(Outcome.DYNAMIC, ids)
 
     # --- output ----------------------------------------------------------------------------------
+
+    @property
+    def imu_stamps_ns(self) -> IntArray:
+        """Times (N,) of the recent IMU samples, ascending, on the clock of states."""
+        return self._context.imu.data.stamps_ns
 
     @property
     def initialized(self) -> bool:

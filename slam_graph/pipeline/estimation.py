@@ -7,6 +7,8 @@ A known start is a first state that comes with the data, or is taken from the gr
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,9 +22,6 @@ from slam_graph.pipeline.recovery import Recovery
 from slam_graph.pipeline.stage import EstimatedFrame
 from slam_graph.pipeline.tracking import TrackedPacket
 from slam_graph.results import RunInput, RunResult
-
-_LEAD_NS = 1_000_000_000
-"""A given state may be this much older than the first frame: the IMU reaches back that far."""
 
 _DIFFERENCE_NS = 25_000_000
 """Half the step of the central difference that gives the velocity where the truth has none."""
@@ -62,7 +61,8 @@ class KnownStart:
         if mode not in ("auto", "given") or (mode == "auto" and not asked.rig.has_scale):
             return KnownStart()  # a state in metres says nothing where all is up to scale
         state = sequence.initial_state()
-        if state is not None and not (asked.start_ns - _LEAD_NS <= state.stamp_ns <= asked.end_ns):
+        first_ns = asked.start_ns - Estimator.LEAD_NS
+        if state is not None and not first_ns <= state.stamp_ns <= asked.end_ns:
             state = None
         if state is None and mode == "given":
             raise DataError(
@@ -110,6 +110,25 @@ def true_state(truth: Trajectory, stamp_ns: int) -> NavState | None:
     )
 
 
+@contextmanager
+def _solvable(where: str) -> Iterator[None]:
+    """Turn a failure of the linear algebra into a divergence: sane states do not cause one.
+
+    Args:
+        where: of the recording, for the message.
+
+    Raises:
+        DivergenceError: if a system is singular.
+    """
+    try:
+        yield
+    except (RuntimeError, np.linalg.LinAlgError) as error:
+        reason = " ".join(str(error).split())[:200]
+        raise DivergenceError(
+            f"diverged at {where}: the equations cannot be solved ({reason})"
+        ) from error
+
+
 class Estimation:
     """Estimates the state at each frame and notes it in the result.
 
@@ -143,11 +162,7 @@ class Estimation:
         try:
             state = self._solve(tracked)
         except DivergenceError as error:
-            self._recovery.begin_segment(error, tracked.features.stamp_ns)
-            self._start = KnownStart()
-            self._result.start_was_given &= len(self._result.segments) > 0
-            if estimator.replayed is not None:
-                self._note_calibration()
+            self._start_again(error, tracked.features.stamp_ns)
             state, lost = None, True
         tracked.clock.lap("backend", {k: 1e3 * s for k, s in estimator.report.timings.items()})
         ids, points = estimator.landmarks()
@@ -158,17 +173,17 @@ class Estimation:
             state,
             ids,
             points,
-            estimator.rejected,
-            estimator.imu_noise,
-            estimator.initialized,
-            estimator.corrected_rig,
-            estimator.replayed is not None or lost,
-            estimator.solved_ns != features.stamp_ns,
-            tracked.clock.milliseconds,
-            tracked.frame_stats,
-            estimator.aiding.aligned,
-            estimator.aiding.offset_s,
-            self._result.fix_calibration,
+            rejected=estimator.rejected,
+            imu_noise=estimator.imu_noise,
+            initialized=estimator.initialized,
+            corrected_rig=estimator.corrected_rig,
+            restarted=estimator.replayed is not None or lost,
+            waits=not lost and estimator.solved_ns != features.stamp_ns,
+            milliseconds=tracked.clock.milliseconds,
+            counts=tracked.frame_stats,
+            georeferenced=estimator.aiding.aligned,
+            fix_offset_s=estimator.aiding.offset_s,
+            fix_calibration=self._result.fix_calibration,
             imu_noise_at_limit=estimator.imu_noise_at_limit,
             rig_on_raw_clock=estimator.rig_on_raw_clock,
             clock_changes=estimator.clock_changes,
@@ -178,13 +193,49 @@ class Estimation:
         return frame
 
     def finish(self) -> None:
-        """Note the states of frames that waited for IMU samples which do not come."""
-        states = self.estimator.finish()
-        if self.estimator.replayed is None:
-            self._recovery.append(states)
-        else:
-            self._recovery.supersede(states)
-        self._note_fixes()
+        """Note the states of frames that waited for IMU samples which do not come.
+
+        Raises:
+            DivergenceError: if the estimate is lost for good.
+        """
+        try:
+            with _solvable("the last frames"):
+                states = self.estimator.finish()
+            self._take_over(states)
+            self._note_fixes()
+        except DivergenceError as error:
+            self._start_again(error, self.estimator.solved_ns)
+
+    def _start_again(self, lost: DivergenceError, noticed_ns: int) -> None:
+        """Begin a new segment: the estimate is lost, as was noticed at a frame.
+
+        Raises:
+            DivergenceError: the same, if a new start has no prospect or is not wanted.
+        """
+        self._recovery.begin_segment(lost, noticed_ns)
+        self._start = KnownStart()
+        self._result.start_was_given &= len(self._result.segments) > 0
+        if self.estimator.replayed is not None:
+            self._note_calibration()
+
+    def _take_over(self, states: list[NavState]) -> None:
+        """Note what a frame has led to, in the place of all before if the estimate began anew.
+
+        Raises:
+            DivergenceError: if a state cannot be true, and those before it are noted; or if the
+                clock of the IMU has changed.
+        """
+        estimator, result = self.estimator, self._result
+        if estimator.replayed is not None:
+            self._recovery.supersede([])
+            self._note_calibration()
+            if not len(result.segments):
+                result.start_was_given &= estimator.start_is_given
+        for state in states:
+            check_sane(state, result.config)
+            self._recovery.append([state])
+        if estimator.clock_change is not None and result.config.limits.recovery:
+            raise DivergenceError(estimator.clock_change.message)
 
     def _note_calibration(self) -> None:
         """Note under which calibration, and in which world, the estimate has begun anew."""
@@ -199,47 +250,33 @@ class Estimation:
 
     def _start_from_known_state(self, stamp_ns: int) -> None:
         state = self._start.at(stamp_ns)
-        if state is not None and stamp_ns - state.stamp_ns <= _LEAD_NS:  # not after a restart
-            self.estimator.start(state)
-            self._result.start_was_given = True
+        if state is None or stamp_ns - state.stamp_ns > Estimator.LEAD_NS:  # as after a restart
+            return
+        self.estimator.start(state)
+        self._result.start_was_given = True
 
     def _solve(self, tracked: TrackedPacket) -> NavState | None:
         """The state at the next frame, checked and noted.
 
         Raises:
-            DivergenceError: if it cannot be true, or the linear algebra fails: a singular system
-                means divergence, as sane states do not cause one.
+            DivergenceError: if it cannot be true, or the images contradict it.
         """
-        estimator, result, features = self.estimator, self._result, tracked.features
+        estimator, features = self.estimator, tracked.features
         stamp_ns = features.stamp_ns
         if not estimator.initialized:
             self._start_from_known_state(tracked.packet.frame.stamp_ns)
         estimator.add_imu(tracked.packet.imu)
         if tracked.packet.aiding is not None and estimator.rig.has_scale:
             estimator.aiding.add(tracked.packet.aiding)
-        self._recovery.check_recorded(stamp_ns, tracked.packet.imu)
-        try:
+        self._recovery.check_recorded(stamp_ns)
+        with _solvable(f"frame {stamp_ns}"):
             state = estimator.add_frame(features)
-        except (RuntimeError, np.linalg.LinAlgError) as error:
-            reason = " ".join(str(error).split())[:200]
-            raise DivergenceError(
-                f"diverged at frame {stamp_ns}: the equations cannot be solved ({reason})"
-            ) from error
-        if estimator.replayed is not None:  # what was said of these frames so far is superseded
-            self._recovery.supersede(estimator.replayed)
-            self._note_calibration()
-            if len(result.segments) < 2:
-                result.start_was_given &= estimator.start_is_given
-        if estimator.clock_change is not None and result.config.limits.recovery:
-            raise DivergenceError(estimator.clock_change.message)
+        self._take_over(estimator.states)
         self._note_fixes()
         if state is not None:
-            check_sane(state, result.config)
             self._recovery.agreement.check(stamp_ns, estimator.report.innovations)
             self._recovery.agreement.check_bridging(estimator, state)
             self._recovery.agreement.check_correction(estimator, features)
-            if estimator.replayed is None:
-                self._recovery.append(estimator.states)
         self._recovery.agreement.check_motion(estimator, features, state)
         return state
 

@@ -1,8 +1,10 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""Who watches a run: viewer, progress, recorder of feature tracks, factor graphs of frames.
+"""Stages that watch a run and change nothing of its estimate.
 
-Factor graphs of single frames: a stage that keeps those that are asked for.
+They keep the factor graphs of single frames, write the estimate so far, and hand each frame to a
+recorder of feature tracks, a progress report and a viewer. These three come from outside of the
+package as well: each has a protocol, and a null object stands for it where there is none.
 """
 
 from __future__ import annotations

@@ -19,7 +19,6 @@ from slam_graph.geometry import NavState
 from slam_graph.pipeline.agreement import Agreement
 from slam_graph.pipeline.divergence import DivergenceError, JumpError, check_sane
 from slam_graph.results import RunResult
-from slam_graph.sensors import ImuData
 
 _MOST_SHORT = 3
 """After so many short segments in a row the run is given up: not a fault that passes is the cause,
@@ -77,20 +76,21 @@ class Recovery:
         self._recent = deque(s for s in self._recent if since_ns and s.stamp_ns < since_ns)
         self.append(states)
 
-    def check_recorded(self, stamp_ns: int, imu: ImuData) -> None:
+    def check_recorded(self, stamp_ns: int) -> None:
         """Refuse to go on after a time of which nothing is recorded.
 
         Args:
-            stamp_ns: time of the next frame.
-            imu: samples since the frame before.
+            stamp_ns: time of the next frame; the estimator has the samples up to it.
 
         Raises:
             DivergenceError: if neither frames nor samples were recorded for too long.
         """
         if not self._recent or not self._estimator.initialized:
             return
-        last_ns, stamps = self._recent[-1].stamp_ns, imu.stamps_ns
-        between = stamps[(stamps > last_ns) & (stamps < stamp_ns)]  # they may lead beyond the frame
+        last_ns = self._recent[-1].stamp_ns
+        # all samples, as those before this frame may have come with an earlier one, on any clock
+        stamps = self._estimator.imu_stamps_ns
+        between = stamps[(stamps > last_ns) & (stamps < stamp_ns)]
         times_ns = [last_ns, *between.tolist(), stamp_ns]
         blind_s = max(later - earlier for earlier, later in pairwise(times_ns)) * 1e-9
         if blind_s > _LONGEST_BLIND_S:

@@ -236,4 +236,6 @@ def _first_cameras(frame: CameraFrame | FeatureFrame, count: int) -> CameraFrame
         if len(frame.images) <= count:
             return frame
         return replace(frame, images=frame.images[:count])
-    return replace(frame, cameras=frame.cameras[:count], outliers=())
+    if len(frame.cameras) <= count:
+        return frame
+    return replace(frame, cameras=frame.cameras[:count], outliers=(), moving=frame.moving[:count])
