@@ -267,6 +267,15 @@ def test_a_wrong_setup_that_starts_is_refused_where_its_estimate_is_lost(fault: 
     assert result.logs.frames / RATE_HZ < 11.0
 
 
+def test_a_wrong_setup_is_refused_six_seconds_after_its_start_where_that_is_enough() -> None:
+    sequence = simulate(trajectory="figure8", cameras=2, duration_s=14.0, rate_hz=RATE_HZ, seed=1)
+    result = run(seen_by(sequence, with_double_baseline(sequence.rig)), overrides=CAUSAL)
+    assert result.status == "failed"
+    assert "the estimate is wrong: the calibrated baseline is" in result.message
+    begun_s = (result.segments[0].begin_ns - result.input.start_ns) * 1e-9
+    assert 6.0 <= result.logs.frames / RATE_HZ - begun_s < 7.0
+
+
 @pytest.mark.slow
 @pytest.mark.data
 @pytest.mark.parametrize(
@@ -285,9 +294,9 @@ def test_a_wrong_setup_under_which_an_estimate_lasts_is_refused_after_some_secon
     data_dir: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Not at the end of a recording that may be long; by the second look if there is no first."""
-    if after_s > 12.0:
-        monkeypatch.setattr(verdict, "_EARLY_LOOK_NS", round(2e9 * after_s))
+    """Not at the end of a recording that may be long; by a later look if there is none before."""
+    looks = [look_ns for look_ns in verdict._EARLY_LOOKS_NS if look_ns >= after_s * 1e9]
+    monkeypatch.setattr(verdict, "_EARLY_LOOKS_NS", looks)
     path = data_dir / "euroc_inertial/V2_01_easy"
     sequence = simulate(
         trajectory=str(path), real_imu=True, cameras=1, duration_s=40.0, rate_hz=RATE_HZ, seed=0

@@ -6,7 +6,7 @@ A run with a wrong calibration may come to its end, with errors that nothing in 
 run is followed by a quick look at the tracks after its start, and one that failed, was not smooth,
 or contradicts that look, by a diagnosis. If that finds a fault in what the run was given, the run
 is `suspect`, whatever it has estimated. A run that does not start is looked at while it waits, and
-one that goes on 12 s after its start, and after 24 s, when all frames are there that are looked at.
+one that goes on after 6, 12 and 24 s, when all frames are there that are looked at.
 The time offset between camera and IMU is watched over the whole run, as it may change later on.
 """
 
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 _FIRST_LOOK_NS = 5_000_000_000
 """A run that has waited so long for a start is looked at, and again after twice that."""
-_EARLY_LOOK_NS = KEPT_NS // 2
+_EARLY_LOOKS_NS = (KEPT_NS // 4, KEPT_NS // 2)
 """An estimate that goes on is looked at so long after its start, and again after `KEPT_NS`."""
 _HINDERING = {"gyroscope_scale": 0.1, "baseline": 0.3}
 """Logarithms of factors from which these keep a run from starting; smaller ones only harm it."""
@@ -93,7 +93,8 @@ class Verdict(Stage):
         self._clocks = ClockWatch(result, objects, diagnostics) if rig.has_imu else None
         self._estimated = self._at_limit = 0  # frames with a state; noise of the IMU at its limit
         self._looked: Diagnosis | None = None  # a quick look at all that is kept
-        self._look_failed = self._looked_early = False
+        self._look_failed = False
+        self._early_looks = 0  # how often the estimate was looked at since its start
         self._started_ns: int | None = None
         self._waits_since_ns: int | None = None
         self._look_ns = 0  # time of waiting after which the recording is looked at next
@@ -113,7 +114,7 @@ class Verdict(Stage):
             self._clocks.add(frame)
         if frame.restarted:
             self._estimated = self._at_limit = 0
-            self._looked, self._look_failed, self._looked_early = None, False, False
+            self._looked, self._look_failed, self._early_looks = None, False, 0
         self._estimated += frame.initialized
         self._at_limit += frame.initialized and frame.imu_noise_at_limit
         if frame.restarted or not frame.initialized:
@@ -123,8 +124,8 @@ class Verdict(Stage):
         elif stamp_ns > self._started_ns + KEPT_NS:
             self._watch_full()
             return
-        elif stamp_ns > self._started_ns + _EARLY_LOOK_NS:
-            self._watch_early()
+        else:
+            self._watch_early(stamp_ns - self._started_ns)
         self._kept.add(frame)
         if frame.initialized:
             self._waits_since_ns = None
@@ -196,14 +197,15 @@ class Verdict(Stage):
             waited = f"the estimate was lost{', ' + waited if waited_ns else ''}"
         self._refuse(waited, rig, _ruins if self._result.segments.lasted else _hinders)
 
-    def _watch_early(self) -> None:
-        """Look once whether the estimate is worth anything, half-way to all that is looked at.
+    def _watch_early(self, lasted_ns: int) -> None:
+        """Look now and then whether the estimate is worth anything, before all frames are there.
 
         Raises:
             DataError: if what the run was given is certainly wrong, and by so much.
         """
-        if self._refuses and not self._looked_early:
-            self._looked_early = True
+        looks = self._early_looks
+        if self._refuses and looks < len(_EARLY_LOOKS_NS) and lasted_ns > _EARLY_LOOKS_NS[looks]:
+            self._early_looks += 1
             self._refuse_if_ruined(self._quick_look())
 
     def _watch_full(self) -> None:
