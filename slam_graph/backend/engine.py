@@ -10,6 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from slam_graph.arrays import FloatArray, IntArray
+from slam_graph.backend.aiding.regauging import left_of_gauge
 from slam_graph.backend.cost.construction import ConstructedCost, CostConstruction
 from slam_graph.backend.cost.cost import Cost
 from slam_graph.backend.cost.track_drift import add_drift_noise
@@ -99,6 +100,10 @@ class SquareRootEngine:
     def information(self, window: Window) -> SquareRootInformation:
         """The posterior of the last step, or what the start left behind."""
         return self._posterior or window.prior
+
+    def left_of_gauge(self, window: Window, level: bool) -> FloatArray | None:
+        """How far the last step has left the world from where its cost is least."""
+        return None if self._posterior is None else left_of_gauge(window, self._posterior, level)
 
     def landmarks(self, window: Window) -> tuple[IntArray, FloatArray]:
         """Ids (N,) and world positions (N, 3) of the features that the last step estimated."""

@@ -173,6 +173,18 @@ class Engine(Protocol):
         """What the last step knew of the variables, the calibration among them."""
         ...
 
+    def left_of_gauge(self, window: Window, level: bool) -> FloatArray | None:
+        """How far (4 or 6: m, rad) the last step has left the world from its least cost.
+
+        Args:
+            window: after the step.
+            level: whether gravity is measured, so that the world turns about the vertical only.
+
+        Returns:
+            Shift and turn about the current body; None if there is nothing to gain.
+        """
+        ...
+
     def landmarks(self, window: Window) -> tuple[IntArray, FloatArray]:
         """Ids (N,) and world positions (N, 3) of the features that the last step estimated."""
         ...

@@ -17,7 +17,7 @@ import numpy as np
 
 from slam_graph.arrays import IntArray, ascending_union
 from slam_graph.backend.aiding.aiding_factors import Aiding
-from slam_graph.backend.aiding.regauging import regauged
+from slam_graph.backend.aiding.regauging import moved_by_gauge, regauged
 from slam_graph.backend.backend_config import BackendConfig
 from slam_graph.backend.cost.calibrated_projection import CalibratedProjection
 from slam_graph.backend.cost.feature_tracks import Outcome
@@ -232,7 +232,7 @@ class Estimator(EstimatorKnowledge):
         state = self._solve(frame)
         found = None if self.window is None else self.aiding.alignment(state)
         if self.window is None or found is None:
-            return state
+            return state if self.window is None else self._moved_by_fixes(self.window, state)
         self.window = regauged(self.window, found, *self.aiding.variables_found(found))
         self._engine = self._make_engine(self._context)
         self._context.propagation.restart()
@@ -359,6 +359,16 @@ class Estimator(EstimatorKnowledge):
             self.replayed = self.states = [state]
         return state
 
+    def _moved_by_fixes(self, window: Window, state: NavState | None) -> NavState | None:
+        """The state, moved with its world as far as fixes ask for it and the steps did not."""
+        if state is None or not self.aiding.aligned:
+            return state
+        g = self._engine.left_of_gauge(window, self.rig.has_imu)
+        if g is not None:
+            self.window, state = moved_by_gauge(window, state, g)
+            self.aiding.note_jump(state.stamp_ns)
+        return state
+
     def exclude(self, ids: IntArray) -> None:
         """Do not use features (N,) any more: they move. What is in the prior of them stays."""
         self._standstill.add_dynamic(ids)
@@ -366,11 +376,6 @@ class Estimator(EstimatorKnowledge):
             self.window.tracks.remove(Outcome.DYNAMIC, ids)
 
     # --- output ----------------------------------------------------------------------------------
-
-    @property
-    def imu_stamps_ns(self) -> IntArray:
-        """Times (N,) of the recent IMU samples, ascending, on the clock of states."""
-        return self._context.imu.data.stamps_ns
 
     @property
     def initialized(self) -> bool:
@@ -388,11 +393,6 @@ class Estimator(EstimatorKnowledge):
         if not self._check.mounted:
             return self._check.waiting_for
         return self._start_up.waiting_for(self._check.contradiction(self._context.imu))
-
-    @property
-    def rejected(self) -> IntArray:
-        """Ids (N,) of the features that the gate rejected in the last frame, ascending."""
-        return self.report.rejected
 
     @property
     def dynamic(self) -> IntArray:

@@ -13,7 +13,7 @@ from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.backend.aiding.aiding_factors import Aiding
 from slam_graph.backend.backend_config import BackendConfig
 from slam_graph.backend.cost.track_fit import TrackFit
-from slam_graph.backend.engine_protocol import Engine, EngineContext
+from slam_graph.backend.engine_protocol import Engine, EngineContext, StepReport
 from slam_graph.backend.initialization.clock_change import ClockChanges
 from slam_graph.backend.initialization.segment_joint import SegmentJoint
 from slam_graph.backend.initialization.start_up import StartUp
@@ -32,17 +32,29 @@ class EstimatorKnowledge:
         aiding: takes position fixes and odometry up to the next frame.
         rig: the sensors, as calibrated or corrected at the start.
         clock_changes: those that are corrected in the IMU samples.
+        report: what is known of the last step besides the state.
     """
 
     window: Window | None
     aiding: Aiding
     rig: Rig
     clock_changes: ClockChanges
+    report: StepReport
     _real_rig: Rig
     _corrected: bool
     _engine: Engine
     _context: EngineContext
     _start_up: StartUp
+
+    @property
+    def imu_stamps_ns(self) -> IntArray:
+        """Times (N,) of the recent IMU samples, ascending, on the clock of states."""
+        return self._context.imu.data.stamps_ns
+
+    @property
+    def rejected(self) -> IntArray:
+        """Ids (N,) of the features that the gate rejected in the last frame, ascending."""
+        return self.report.rejected
 
     def covariance_of(self, keys: Sequence[int]) -> FloatArray:
         """The joint covariance (n, n) of variables after the last step.

@@ -89,7 +89,7 @@ class Aiding:
         self.gates: defaultdict[str, FixGate] = defaultdict(FixGate)
         self.used, self.offset_s, self._offset_sigma_s = False, 0.0, 0.0
         self._shifted_s = 0.0  # added to the times of fixes that wait
-        self._revised_ns = -_REVISED_NS
+        self._revised_ns = int(np.iinfo(np.int64).min) // 2  # never
         self.restart()
 
     @property
@@ -214,8 +214,12 @@ class Aiding:
         self.offset_s, self.lever_arm_m = float(found[0]), found[1:]
         return prior.covariance_of(variables.keys)
 
+    def note_jump(self, stamp_ns: int) -> None:
+        """Note that the world was moved by what fixes say of it, and the body with it."""
+        self._revised_ns = stamp_ns
+
     def was_revised(self, stamp_ns: int) -> bool:
-        """Whether lever arm or clock were corrected so much lately that the body has jumped."""
+        """Whether world, lever arm or clock were corrected so much lately that the body jumped."""
         return stamp_ns - self._revised_ns < _REVISED_NS
 
     def calibration(

@@ -1,12 +1,18 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""A window in a world that is moved, with what is not known of the motion added to its prior.
+"""A window in a world that is moved: to where the fixes are, or to where its prior wants it.
 
 The prior ‖R δ - d‖² is relative to the first state. A world that is moved by an error g of the
 gauge moves all variables by N g, with N the directions that no image measures. So the prior of the
 moved variables is min over g of ‖R (δ - N g) - d‖² + ‖Γ^-½ g‖², by a QR whose columns begin with g.
 Lever arm and clock of the fixes, where they are variables, enter with it: Γ is then the joint
 covariance of the gauge and of them.
+
+Later fixes move the world further. A step along straight tangents stretches what it turns, by half
+of the squared angle, which the dynamics contradict; so where steps are judged by the cost and
+damped (Levenberg-Marquardt), the world would stay where it is while its covariance shrinks. What is
+left of such a step along N is taken as the motion that it stands for, under which images and
+dynamics stay as they are.
 """
 
 from __future__ import annotations
@@ -16,6 +22,7 @@ from dataclasses import replace
 
 import gtsam
 import numpy as np
+from gtsam.symbol_shorthand import X
 
 from slam_graph.arrays import FloatArray
 from slam_graph.backend.aiding.world_alignment import WorldAlignment
@@ -24,7 +31,11 @@ from slam_graph.backend.marginalization.landmark_store import LandmarkStore
 from slam_graph.backend.solve.square_root import Layout, SquareRootInformation, triangularize
 from slam_graph.backend.solve.state import dims_of, letter_and_index
 from slam_graph.backend.window import Window
-from slam_graph.backend.world_gauge import turned_axes
+from slam_graph.backend.world_gauge import in_moved_world, turned_axes
+from slam_graph.geometry import NavState
+
+_LEAST_GAIN = 1.0
+"""Least decrease of the squared errors for which the world is moved again."""
 
 
 def regauged(
@@ -60,6 +71,51 @@ def regauged(
         calibration=(*window.calibration, *keys),
         lost_features=store,
     )
+
+
+def left_of_gauge(
+    window: Window, posterior: SquareRootInformation, level: bool
+) -> FloatArray | None:
+    """How far (4 or 6: m, rad) a step has left the world from where its cost is least.
+
+    Args:
+        window: after the step.
+        posterior: of it, over an increment of the estimates.
+        level: whether gravity is measured.
+
+    Returns:
+        Shift and turn about the current body; None if the cost would hardly fall.
+    """
+    if posterior.d @ posterior.d < _LEAST_GAIN:
+        return None
+    centre = window.state.frames.atPose3(X(window.frame)).translation()
+    known = posterior.marginal([k for k in window.state.variables() if k in posterior.layout.dims])
+    by_gauge = known.R @ gauge_directions(window.state.first, known.layout, centre, level)
+    g = np.linalg.lstsq(by_gauge, known.d, rcond=None)[0]
+    gain = known.d @ known.d - np.sum((known.d - by_gauge @ g) ** 2)
+    return np.asarray(g) if gain >= _LEAST_GAIN else None
+
+
+def moved_by_gauge(window: Window, state: NavState, g: FloatArray) -> tuple[Window, NavState]:
+    """Window and last state in a world that is moved, within what the prior knows of it.
+
+    Features that are not tracked any more are forgotten.
+
+    Args:
+        window: between two steps.
+        state: of its last frame.
+        g: (4 or 6,) shift (m) and turn (rad) about this state.
+    """
+    level, centre = len(g) == 4, state.world_T_body.translation()
+    turn = gtsam.Rot3.Expmap(turned_axes(level).T @ g[3:])
+    motion = gtsam.Pose3(turn, centre + g[:3] - turn.rotate(centre))
+    there = moved(window, motion)
+    prior = there.prior
+    N = gauge_directions(there.state.first, prior.layout, centre + g[:3], level)
+    store = LandmarkStore()
+    store.open = window.lost_features.open
+    there = replace(there, prior=prior.shifted(N @ g), lost_features=store)
+    return there, in_moved_world([state], motion)[0]
 
 
 def with_free_gauge(

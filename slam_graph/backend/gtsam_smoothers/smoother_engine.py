@@ -77,6 +77,9 @@ class SmootherEngine:
         """What is known of the newest state in the graph."""
         return window.prior
 
+    def left_of_gauge(self, window: Window, level: bool) -> None:
+        """Nothing: the smoothers take whole steps."""
+
     def landmarks(self, window: Window) -> tuple[IntArray, FloatArray]:
         """Ids (N,) and world positions (N, 3) of the features that are variables and tracked."""
         return self._features.active, stacked_points(self._estimate, self._features.active)
