@@ -9,11 +9,13 @@ import gtsam
 import numpy as np
 import pytest
 from flight import FISHEYE, RADTAN, Flight, rig, room, scene
+from groups import slow
 from gtsam.symbol_shorthand import B, L, V, X
 
 from slam_graph.backend.backend_config import BackendConfig
 from slam_graph.backend.cost.reprojection import RigProjection
 from slam_graph.backend.cost.robust_loss import RobustLoss
+from slam_graph.backend.gtsam_smoothers import smoother_solvers
 from slam_graph.backend.gtsam_smoothers.smoother_features import (
     ProjectionFactors,
     joint_prior,
@@ -29,6 +31,7 @@ from slam_graph.evaluation.absolute_pose_error import ape
 from slam_graph.geometry.trajectory import NavState
 from slam_graph.pipeline.run_recording import run
 from slam_graph.sensors.camera import Camera
+from slam_graph.simulation import simulate
 
 PLAIN = replace(RADTAN, distortion="none", coefficients=())
 
@@ -73,6 +76,46 @@ def test_a_smoother_gives_back_its_prior(name: str) -> None:
     solver.update([joint_prior(prior_of(given), values)], values, dict.fromkeys(keys, 0.0))
     np.testing.assert_allclose(solver.covariance(keys), covariance, rtol=1e-6, atol=1e-12)
     assert solver.estimate(keys).atPose3(X(0)).equals(turned, 1e-9)
+
+
+def test_a_dense_covariance_is_that_of_elimination() -> None:
+    """Of poses in a chain, the last of them given first."""
+    rng, values = np.random.default_rng(6), gtsam.Values()
+    noise = gtsam.noiseModel.Diagonal.Sigmas(rng.uniform(0.01, 1.0, 6))
+    graph = gtsam.NonlinearFactorGraph()
+    graph.push_back(gtsam.PriorFactorPose3(X(0), gtsam.Pose3(), noise))
+    step = gtsam.Pose3(gtsam.Rot3.RzRyRx(0.1, 0.2, 0.3), np.array([1.0, 0.5, 0.2]))
+    for k in range(5):
+        values.insert(X(k), gtsam.Pose3() if not k else values.atPose3(X(k - 1)).compose(step))
+        if k:
+            graph.push_back(gtsam.BetweenFactorPose3(X(k - 1), X(k), step, noise))
+    linear, keys = graph.linearize(values), [X(4), X(2)]
+    order = gtsam.Ordering.ColamdConstrainedLastGaussianFactorGraph(linear, keys)
+    found = smoother_solvers._covariance_of_dense(linear, order, keys)
+    joint = gtsam.Marginals(graph, values).jointMarginalCovariance(keys)
+    expected = np.block([[joint.at(i, j) for j in keys] for i in keys])
+    np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize("name", ["fixed_lag_isam2", slow("isam2"), slow("fixed_lag_batch")])
+def test_a_drive_with_an_imu_and_fixes_of_a_metre(name: str) -> None:
+    drive = simulate(
+        trajectory="car",
+        with_imu=True,
+        seed=1,
+        duration_s=8.0,
+        tracks={"features": 40},
+        gnss={"sigma_m": 1.0, "rate_hz": 2.0},
+    )
+    told = load_config(overrides=["final_ba.enabled=false"], algorithm=name)
+    result = run(drive, told)
+    assert result.status == "ok"
+    assert len(result.segments) == 1
+    assert result.georeferenced
+    assert "smoother_restarted" not in result.warnings
+    assert result.groundtruth is not None
+    errors = ape(result.groundtruth, result.trajectory, "trans_part", "none").values
+    assert np.max(errors[-10:]) < 2.0
 
 
 @pytest.mark.slow

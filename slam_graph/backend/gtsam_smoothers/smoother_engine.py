@@ -8,6 +8,8 @@ velocities, and one prior. See docs/engine.md.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import L, X
@@ -171,36 +173,58 @@ class SmootherEngine:
         return (stamp_ns - self._origin_ns) * 1e-9
 
     def _solve(self, window: Window, ahead: Window, new: NewObservations) -> None:
-        """Update the smoother; without new features if that fails, then from the last state."""
+        """Update the smoother; by QR, or without new features, or from the last state if it fails.
+
+        GTSAM's multifrontal Cholesky refuses some problems that are determined, such as those of an
+        IMU and fixes that tell the position to a metre (condition number 5e10).
+        """
         if self._solver is None:
             self._solver = self._begin(window)
         stamps = dict.fromkeys(imu_state_keys(ahead.frame), self._seconds(ahead.stamp_ns))
         values = _values_of(ahead.state, ahead.frame)
-        old_factors, (old_values, old_stamps) = self._solver.factors(), self._solver.everything()
+        both = gtsam.Values(values)
+        both.insert(new.points)
+        all_stamps = stamps | dict.fromkeys(new.seen, self._seconds(ahead.stamp_ns))
+        factors = [*ahead.factors, *new.factors]
+        before = self._solver.factors(), *self._solver.everything()
         try:
-            seen = dict.fromkeys(new.seen, self._seconds(ahead.stamp_ns))
-            both = gtsam.Values(values)
-            both.insert(new.points)
-            self._solver.update([*ahead.factors, *new.factors], both, {**stamps, **seen})
+            self._solver.update(factors, both, all_stamps)
             return
         except RuntimeError as error:
-            reason = " ".join(str(error).split())[:120]
-            message = f"the features of one frame are not used ({reason})"
-            self._context.diagnostics.warn("features_degenerate", message)
+            reason = _one_line(error)
+        if self._policy.factorization == "cholesky":
+            self._policy = self._policy.model_copy(update={"factorization": "qr"})
+            self._context.diagnostics.warn("smoother_by_qr", f"QR instead of Cholesky ({reason})")
+            try:
+                self._rebuild(before, factors, both, all_stamps)
+                return
+            except RuntimeError as error:
+                reason = _one_line(error)
+        message = f"the features of one frame are not used ({reason})"
+        self._context.diagnostics.warn("features_degenerate", message)
         try:
-            self._solver = SOLVERS[self._context.algorithm.engine](self._policy)
-            old_values.insert(values)
-            rebuilt = [old_factors.at(k) for k in range(old_factors.size())]
-            factors = [
-                f for f in rebuilt if f is not None and all(map(old_values.exists, f.keys()))
-            ]
-            self._solver.update([*factors, *ahead.factors], old_values, {**old_stamps, **stamps})
+            self._rebuild(before, ahead.factors, values, stamps)
         except RuntimeError as error:
-            reason = " ".join(str(error).split())[:120]
-            message = f"the graph is restarted from the last state ({reason})"
+            message = f"the graph is restarted from the last state ({_one_line(error)})"
             self._context.diagnostics.warn("smoother_restarted", message)
             self._solver = self._begin(window)
             self._solver.update(ahead.factors, values, stamps)
+
+    def _rebuild(
+        self,
+        before: tuple[gtsam.NonlinearFactorGraph, gtsam.Values, dict[int, float]],
+        factors: Sequence[gtsam.NonlinearFactor],
+        values: gtsam.Values,
+        stamps: dict[int, float],
+    ) -> None:
+        """Give all factors to a new smoother: one that has failed cannot be used any more."""
+        graph, known, known_stamps = before
+        known = gtsam.Values(known)
+        known.insert(values)
+        held = [graph.at(k) for k in range(graph.size())]
+        alive = [f for f in held if f is not None and all(map(known.exists, f.keys()))]
+        self._solver = SOLVERS[self._context.algorithm.engine](self._policy)
+        self._solver.update([*alive, *factors], known, {**known_stamps, **stamps})
 
     def _begin(self, window: Window) -> SmootherSolver:
         """A smoother that holds the state of a window only."""
@@ -257,6 +281,11 @@ class SmootherEngine:
         self._estimate = self._solver.estimate(dict.fromkeys([*keys, *imu_state_keys(ahead.frame)]))
         self._frames = {i: t for i, t in self._frames.items() if self._estimate.exists(X(i))}
         self._features.retain(self._estimate)
+
+
+def _one_line(error: RuntimeError) -> str:
+    """The beginning of what GTSAM says."""
+    return " ".join(str(error).split())[:120]
 
 
 def _values_of(state: State, frame: int) -> gtsam.Values:

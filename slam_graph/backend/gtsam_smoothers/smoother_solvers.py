@@ -81,15 +81,46 @@ def _covariance_of_graph(
     """Joint marginal covariance of some variables, which are eliminated last and so in the root."""
     linear = graph.linearize(at)
     order = gtsam.Ordering.ColamdConstrainedLastGaussianFactorGraph(linear, list(keys))
-    root = linear.eliminateMultifrontal(order).roots()[0].conditional()
+    try:
+        root = linear.eliminateMultifrontal(order).roots()[0].conditional()
+    except RuntimeError:  # it refuses some graphs that are determined
+        return _covariance_of_dense(linear, order, keys)
     size = sum(dim(key) for key in keys)
-    ends = np.cumsum([dim(key) for key in root.keys()])  # noqa: SIM118
-    columns = dict(zip(root.keys(), ends, strict=True))
-    order_in_root = np.concatenate([np.arange(columns[k] - dim(k), columns[k]) for k in keys])
-    order_in_root -= int(ends[-1]) - size
-    inverse = np.linalg.inv(root.R()[-size:, -size:])
-    covariance: FloatArray = (inverse @ inverse.T)[np.ix_(order_in_root, order_in_root)]
-    return covariance
+    return _in_order(np.linalg.inv(root.R()[-size:, -size:]), list(root.keys()), keys)
+
+
+def _in_order(root: FloatArray, ordered: Sequence[int], keys: Sequence[int]) -> FloatArray:
+    """The covariance (n, n) of variables from the inverse (n, n) of their block of R.
+
+    Args:
+        root: that inverse; the block is the last of R.
+        ordered: all variables of R, in its order.
+        keys: the last of them, in the order that is asked for.
+    """
+    ends = dict(zip(ordered, np.cumsum([dim(key) for key in ordered]).tolist(), strict=True))
+    begin = max(ends.values()) - len(root)
+    places = np.concatenate([np.arange(ends[k] - dim(k), ends[k]) for k in keys]) - begin
+    return np.asarray((root @ root.T)[np.ix_(places, places)], dtype=np.float64)
+
+
+def _covariance_of_dense(
+    linear: gtsam.GaussianFactorGraph, order: gtsam.Ordering, keys: Sequence[int]
+) -> FloatArray:
+    """The same by a dense Cholesky decomposition of variables that are scaled alike.
+
+    Args:
+        linear: the graph.
+        order: of its variables; those that are asked for come last, in any order.
+        keys: these.
+
+    Raises:
+        numpy.linalg.LinAlgError: if the graph is indeterminate indeed.
+    """
+    H, size = linear.hessian(order)[0], sum(dim(key) for key in keys)
+    scale = 1.0 / np.sqrt(np.diag(H))
+    R = np.linalg.cholesky(scale[:, None] * H * scale).T
+    root = scale[-size:, None] * np.linalg.inv(R[-size:, -size:])
+    return _in_order(root, [order.at(k) for k in range(order.size())], keys)
 
 
 class _FixedLag:
