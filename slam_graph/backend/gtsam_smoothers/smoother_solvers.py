@@ -86,7 +86,8 @@ def _covariance_of_graph(
     except RuntimeError:  # it refuses some graphs that are determined
         return _covariance_of_dense(linear, order, keys)
     size = sum(dim(key) for key in keys)
-    return _in_order(np.linalg.inv(root.R()[-size:, -size:]), list(root.keys()), keys)
+    inverse = np.asarray(np.linalg.inv(root.R()[-size:, -size:]), dtype=np.float64)
+    return _in_order(inverse, list(root.keys()), keys)
 
 
 def _in_order(root: FloatArray, ordered: Sequence[int], keys: Sequence[int]) -> FloatArray:
