@@ -1,10 +1,9 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""Features of GTSAM's smoothers: which are variables, and the factors of observations.
+"""Features of GTSAM's smoothers: which are variables, and which observations become factors.
 
-Features of GTSAM's smoothers: which are variables, and which observations become factors. A feature
-enters with all its observations in the lag once these determine its position. Every later state
-that sees it adds one observation. It leaves when no state in the lag has seen it.
+A feature enters with all its observations in the lag once these determine its position. Every later
+state that sees it adds one observation. It leaves when no state in the lag has seen it.
 """
 
 from __future__ import annotations
