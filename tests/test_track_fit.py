@@ -11,7 +11,9 @@ import pytest
 from slam_graph.arrays import FloatArray
 from slam_graph.backend.cost.track_fit import Fit, TrackFit
 from slam_graph.datasets import RecordedSequence
+from slam_graph.datasets.faults.injection import inject
 from slam_graph.geometry import NavState, interpolate
+from slam_graph.pipeline.run_recording import run
 from slam_graph.sensors import FeatureFrame
 from slam_graph.simulation.simulator import simulate
 
@@ -103,3 +105,31 @@ def test_an_estimate_that_corrects_itself_does_not_jump(flight: RecordedSequence
 def test_a_pose_that_is_wrong_for_a_moment_is_no_jump(flight: RecordedSequence) -> None:
     found = fits(flight, lambda t: np.array([0.5, -0.3, 0.4]) * (JUMP_S < t < JUMP_S + 0.4))
     assert not any(fit.jumped for fit in found)
+
+
+def driven(seed: int, duration_s: float) -> RecordedSequence:
+    """With an IMU, and fixes that are more uncertain than the motion over a second."""
+    return simulate(
+        trajectory="car",
+        seed=seed,
+        duration_s=duration_s,
+        rate_hz=10.0,
+        tracks={"features": 60},
+        gnss={"sigma_m": 1.0, "rate_hz": 2.0},
+    )
+
+
+def test_what_fixes_correct_is_no_contradiction() -> None:
+    """Poses that were reported jump by decimetres with each of the first fixes."""
+    result = run(driven(6, 11.0), overrides=["final_ba.enabled=false"])
+    assert result.status == "ok"
+    assert result.georeferenced
+    assert len(result.segments) == 1
+
+
+@pytest.mark.slow
+def test_a_loss_is_noticed_though_fixes_correct_the_poses() -> None:
+    kidnapped = inject(driven(8, 20.0), ["kidnapped:at_s=12,duration_s=2"])
+    result = run(kidnapped, overrides=["final_ba.enabled=false"])
+    ((begin_ns, _),) = result.segments.losses
+    assert 10.5 < (begin_ns - result.input.start_ns) * 1e-9 < 14.5

@@ -111,7 +111,8 @@ class Agreement:
             return
         known = estimator.rig_now, estimator.assumed_noise_px, estimator.dynamic
         predicted = estimator.predicted if solved is frame else None
-        found = self._fit.add(state, solved, *known, estimator.motion, predicted)
+        aided = estimator.aiding.aligned
+        found = self._fit.add(state, solved, *known, estimator.motion, predicted, aided)
         if found is None:
             return
         revised = estimator.aiding.was_revised(state.stamp_ns)

@@ -123,6 +123,7 @@ class TrackFit:
         moving: IntArray,
         motion: FrameMotion | None = None,
         predicted: gtsam.Pose3 | None = None,
+        aided: bool = False,
     ) -> Fit | None:
         """Take the next frame.
 
@@ -135,6 +136,8 @@ class TrackFit:
             motion: of the body within the frame, for rolling shutters.
             predicted: `world_T_body` of this frame, predicted by the IMU from the pose reported for
                 the frame before; None where that is not known.
+            aided: whether fixes correct the poses, by more than tracks allow: those that fit the
+                poses without the corrections fit as well.
 
         Returns:
             How the tracks compare; None if it is too early for the next comparison.
@@ -156,6 +159,8 @@ class TrackFit:
         motions = {p.index: p.motion for p in self._poses if p.motion is not None}
         projection = RigProjection(rig, motions)
         errors = self._errors(ids, projection)
+        if aided:
+            errors = np.minimum(errors, self._errors(ids, projection, carried=True))
         unfit = int(np.count_nonzero(errors >= _LARGEST * sigma_px))
         enough = len(ids) >= _JUMPED
         bad = enough and unfit >= _LOST_SHARE * len(ids)
