@@ -7,10 +7,11 @@ Every recursive algorithm is this loop under its own policies (`policies.py`). S
 
 from __future__ import annotations
 
+import gtsam
 import numpy as np
 
 from slam_graph.arrays import FloatArray, IntArray
-from slam_graph.backend.aiding.regauging import left_of_gauge
+from slam_graph.backend.aiding.regauging import LEAST_GAIN, left_of_gauge, moved_by_gauge
 from slam_graph.backend.cost.construction import ConstructedCost, CostConstruction
 from slam_graph.backend.cost.cost import Cost
 from slam_graph.backend.cost.track_drift import add_drift_noise
@@ -101,9 +102,18 @@ class SquareRootEngine:
         """The posterior of the last step, or what the start left behind."""
         return self._posterior or window.prior
 
-    def left_of_gauge(self, window: Window, level: bool) -> FloatArray | None:
-        """How far the last step has left the world from where its cost is least."""
-        return None if self._posterior is None else left_of_gauge(window, self._posterior, level)
+    def followed(self, window: Window, level: bool) -> tuple[Window, gtsam.Pose3] | None:
+        """The window in the world where the cost of the last step is least, and the motion."""
+        posterior = self._posterior
+        if posterior is None or posterior.d @ posterior.d < LEAST_GAIN:
+            return None
+        staying = [key for key in window.state.variables() if key in posterior.layout.dims]
+        known = posterior.marginal(staying)
+        g = left_of_gauge(window, known, level)
+        if g is None:
+            return None
+        window, self._posterior, motion = moved_by_gauge(window, known, g)
+        return window, motion
 
     def landmarks(self, window: Window) -> tuple[IntArray, FloatArray]:
         """Ids (N,) and world positions (N, 3) of the features that the last step estimated."""

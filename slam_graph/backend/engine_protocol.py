@@ -15,6 +15,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Protocol
 
+import gtsam
 import numpy as np
 
 from slam_graph.arrays import FloatArray, IntArray
@@ -173,15 +174,15 @@ class Engine(Protocol):
         """What the last step knew of the variables, the calibration among them."""
         ...
 
-    def left_of_gauge(self, window: Window, level: bool) -> FloatArray | None:
-        """How far (4 or 6: m, rad) the last step has left the world from its least cost.
+    def followed(self, window: Window, level: bool) -> tuple[Window, gtsam.Pose3] | None:
+        """The window in the world where the cost of the last step is least.
 
         Args:
             window: after the step.
             level: whether gravity is measured, so that the world turns about the vertical only.
 
         Returns:
-            Shift and turn about the current body; None if there is nothing to gain.
+            With the motion new_T_old of the worlds; None if there is nothing to gain.
         """
         ...
 

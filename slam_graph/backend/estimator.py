@@ -17,7 +17,7 @@ import numpy as np
 
 from slam_graph.arrays import IntArray, ascending_union
 from slam_graph.backend.aiding.aiding_factors import Aiding
-from slam_graph.backend.aiding.regauging import moved_by_gauge, regauged
+from slam_graph.backend.aiding.regauging import regauged
 from slam_graph.backend.backend_config import BackendConfig
 from slam_graph.backend.cost.calibrated_projection import CalibratedProjection
 from slam_graph.backend.cost.feature_tracks import Outcome
@@ -223,7 +223,7 @@ class Estimator(EstimatorKnowledge):
     def finish(self) -> list[NavState]:
         """States at frames that still wait, when no more IMU samples come; in `states` too."""
         with self._single_thread.held():
-            self.replayed = None
+            self.replayed = self.clock_change = None
             self.states = self._take_held(MAX_EARLY_NS)
             return self.states
 
@@ -363,10 +363,10 @@ class Estimator(EstimatorKnowledge):
         """The state, moved with its world as far as fixes ask for it and the steps did not."""
         if state is None or not self.aiding.aligned:
             return state
-        g = self._engine.left_of_gauge(window, self.rig.has_imu)
-        if g is not None:
-            self.window, state = moved_by_gauge(window, state, g)
-            self.aiding.note_jump(state.stamp_ns)
+        found = self._engine.followed(window, self.rig.has_imu)
+        if found is not None:
+            self.window, motion = found
+            state = self.aiding.in_moved_world(state, motion)
         return state
 
     def exclude(self, ids: IntArray) -> None:

@@ -39,12 +39,15 @@ def world_motion(moving: gtsam.Pose3, fixed: gtsam.Pose3, level: bool) -> gtsam.
 
 
 def in_moved_world(states: list[NavState], motion: gtsam.Pose3) -> list[NavState]:
-    """States in a world that is moved by `new_T_old`."""
+    """States in a world that is moved by `new_T_old`, with their covariances."""
+    turn = np.eye(_ERROR)  # errors of poses and biases are in axes of the body
+    turn[_VELOCITY, _VELOCITY] = motion.rotation().matrix()
     return [
         replace(
             state,
             world_T_body=motion.compose(state.world_T_body),
             velocity=np.asarray(motion.rotation().rotate(state.velocity)),
+            covariance=None if state.covariance is None else turn @ state.covariance @ turn.T,
         )
         for state in states
     ]

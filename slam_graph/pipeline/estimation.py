@@ -199,12 +199,17 @@ class Estimation:
             DivergenceError: if the estimate is lost for good.
         """
         try:
-            with _solvable("the last frames"):
-                states = self.estimator.finish()
-            self._take_over(states)
-            self._note_fixes()
+            self._take_last()
         except DivergenceError as error:
             self._start_again(error, self.estimator.solved_ns)
+            self._take_last()
+
+    def _take_last(self) -> None:
+        """Note what the frames that still wait lead to."""
+        with _solvable("the last frames"):
+            states = self.estimator.finish()
+        self._take_over(states)
+        self._note_fixes()
 
     def _start_again(self, lost: DivergenceError, noticed_ns: int) -> None:
         """Begin a new segment: the estimate is lost, as was noticed at a frame.

@@ -214,9 +214,16 @@ class Aiding:
         self.offset_s, self.lever_arm_m = float(found[0]), found[1:]
         return prior.covariance_of(variables.keys)
 
-    def note_jump(self, stamp_ns: int) -> None:
-        """Note that the world was moved by what fixes say of it, and the body with it."""
-        self._revised_ns = stamp_ns
+    def in_moved_world(self, state: NavState, motion: gtsam.Pose3) -> NavState:
+        """The last state where fixes have moved it with its world, and the path before it as well.
+
+        Args:
+            state: the last one.
+            motion: new_T_old of the worlds.
+        """
+        self._path.states = in_moved_world(self._path.states, motion)
+        self._revised_ns = state.stamp_ns
+        return in_moved_world([state], motion)[0]
 
     def was_revised(self, stamp_ns: int) -> bool:
         """Whether world, lever arm or clock were corrected so much lately that the body jumped."""

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""A window in a world that is moved: to where the fixes are, or to where its prior wants it.
+"""A window in a world that is moved: to where fixes say that it is, at first and from then on.
 
 The prior ‖R δ - d‖² is relative to the first state. A world that is moved by an error g of the
 gauge moves all variables by N g, with N the directions that no image measures. So the prior of the
@@ -26,15 +26,14 @@ from gtsam.symbol_shorthand import X
 
 from slam_graph.arrays import FloatArray
 from slam_graph.backend.aiding.world_alignment import WorldAlignment
-from slam_graph.backend.initialization.segment_joint import moved
+from slam_graph.backend.initialization.segment_joint import moved, turned
 from slam_graph.backend.marginalization.landmark_store import LandmarkStore
 from slam_graph.backend.solve.square_root import Layout, SquareRootInformation, triangularize
 from slam_graph.backend.solve.state import dims_of, letter_and_index
 from slam_graph.backend.window import Window
-from slam_graph.backend.world_gauge import in_moved_world, turned_axes
-from slam_graph.geometry import NavState
+from slam_graph.backend.world_gauge import turned_axes
 
-_LEAST_GAIN = 1.0
+LEAST_GAIN = 1.0
 """Least decrease of the squared errors for which the world is moved again."""
 
 
@@ -73,49 +72,56 @@ def regauged(
     )
 
 
-def left_of_gauge(
-    window: Window, posterior: SquareRootInformation, level: bool
-) -> FloatArray | None:
+def left_of_gauge(window: Window, known: SquareRootInformation, level: bool) -> FloatArray | None:
     """How far (4 or 6: m, rad) a step has left the world from where its cost is least.
+
+    All else is held: only the motion of the world is asked for.
 
     Args:
         window: after the step.
-        posterior: of it, over an increment of the estimates.
+        known: posterior of its variables, over an increment of the estimates.
         level: whether gravity is measured.
 
     Returns:
         Shift and turn about the current body; None if the cost would hardly fall.
     """
-    if posterior.d @ posterior.d < _LEAST_GAIN:
-        return None
     centre = window.state.frames.atPose3(X(window.frame)).translation()
-    known = posterior.marginal([k for k in window.state.variables() if k in posterior.layout.dims])
     by_gauge = known.R @ gauge_directions(window.state.first, known.layout, centre, level)
     g = np.linalg.lstsq(by_gauge, known.d, rcond=None)[0]
     gain = known.d @ known.d - np.sum((known.d - by_gauge @ g) ** 2)
-    return np.asarray(g) if gain >= _LEAST_GAIN else None
+    return np.asarray(g) if gain >= LEAST_GAIN else None
 
 
-def moved_by_gauge(window: Window, state: NavState, g: FloatArray) -> tuple[Window, NavState]:
-    """Window and last state in a world that is moved, within what the prior knows of it.
+def moved_by_gauge(
+    window: Window, known: SquareRootInformation, g: FloatArray
+) -> tuple[Window, SquareRootInformation, gtsam.Pose3]:
+    """A window in a world that is moved; what is known of its place stays.
 
-    Features that are not tracked any more are forgotten.
+    Factors of fixes stay as they are: they measure in the world that does not move. Features that
+    are not tracked any more are forgotten.
 
     Args:
         window: between two steps.
-        state: of its last frame.
-        g: (4 or 6,) shift (m) and turn (rad) about this state.
+        known: posterior of its variables, over an increment of the estimates.
+        g: (4 or 6,) shift (m) and turn (rad) about the current body.
+
+    Returns:
+        The window, the posterior there, and the motion new_T_old.
     """
-    level, centre = len(g) == 4, state.world_T_body.translation()
+    level, centre = len(g) == 4, window.state.frames.atPose3(X(window.frame)).translation()
     turn = gtsam.Rot3.Expmap(turned_axes(level).T @ g[3:])
     motion = gtsam.Pose3(turn, centre + g[:3] - turn.rotate(centre))
     there = moved(window, motion)
-    prior = there.prior
-    N = gauge_directions(there.state.first, prior.layout, centre + g[:3], level)
+
+    def shifted(information: SquareRootInformation) -> SquareRootInformation:
+        layout = information.layout
+        N = gauge_directions(there.state.first, layout, centre + g[:3], level)
+        return information.shifted(N @ g)
+
     store = LandmarkStore()
     store.open = window.lost_features.open
-    there = replace(there, prior=prior.shifted(N @ g), lost_features=store)
-    return there, in_moved_world([state], motion)[0]
+    there = replace(there, prior=shifted(there.prior), lost_features=store)
+    return there, shifted(turned(known, turn.matrix())), motion
 
 
 def with_free_gauge(

@@ -79,8 +79,8 @@ class SmootherEngine:
         """What is known of the newest state in the graph."""
         return window.prior
 
-    def left_of_gauge(self, window: Window, level: bool) -> None:
-        """Nothing: the smoothers take whole steps."""
+    def followed(self, window: Window, level: bool) -> None:
+        """Nothing: what is in the lag is linearised anew, and so follows the fixes by itself."""
 
     def landmarks(self, window: Window) -> tuple[IntArray, FloatArray]:
         """Ids (N,) and world positions (N, 3) of the features that are variables and tracked."""
@@ -193,13 +193,15 @@ class SmootherEngine:
         except RuntimeError as error:
             reason = _one_line(error)
         if self._policy.factorization == "cholesky":
-            self._policy = self._policy.model_copy(update={"factorization": "qr"})
-            self._context.diagnostics.warn("smoother_by_qr", f"QR instead of Cholesky ({reason})")
+            by_cholesky = self._policy
+            self._policy = by_cholesky.model_copy(update={"factorization": "qr"})
             try:
                 self._rebuild(before, factors, both, all_stamps)
+                warning = f"QR instead of Cholesky ({reason})"
+                self._context.diagnostics.warn("smoother_by_qr", warning)
                 return
             except RuntimeError as error:
-                reason = _one_line(error)
+                self._policy, reason = by_cholesky, _one_line(error)
         message = f"the features of one frame are not used ({reason})"
         self._context.diagnostics.warn("features_degenerate", message)
         try:

@@ -90,9 +90,9 @@ def moved(window: Window, motion: gtsam.Pose3) -> Window:
     """A window in a world that is moved: one that has just begun, or a running one between steps.
 
     Args:
-        window: with no factor of where it is in the world: dynamics, standstill and odometry are
-            the same in every world, fixes are not. Waiting observations are in images. Features in
-            `lost_features` stay in the world before.
+        window: whose factors, if it has some, hold there too: dynamics, standstill and odometry are
+            the same in every world, and fixes stay if it is the estimate that is moved. Waiting
+            observations are in images. Features in `lost_features` stay in the world before.
         motion: new_T_old of the two worlds; with an IMU position and a rotation about the vertical,
             as gravity, which the dynamics have, stays.
     """
@@ -105,13 +105,13 @@ def moved(window: Window, motion: gtsam.Pose3) -> Window:
     return replace(
         window,
         state=window.state.moved(motion),
-        prior=_turned(window.prior, rotation),
+        prior=turned(window.prior, rotation),
         kept_points=there(window.kept_points),
         last_points=there(window.last_points),
     )
 
 
-def _turned(prior: SquareRootInformation, rotation: FloatArray) -> SquareRootInformation:
+def turned(prior: SquareRootInformation, rotation: FloatArray) -> SquareRootInformation:
     """A prior with the axes of velocities and points turned; tangents of poses are of the body."""
     Rd = np.array(prior.Rd)
     for key in prior.layout.dims:
