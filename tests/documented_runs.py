@@ -168,7 +168,7 @@ class Session:
 
 def shortened(words: list[str]) -> list[str]:
     """A command whose simulation or comparison is short, with few seeds and early faults."""
-    made = [re.sub(r"\bat_s=[\d.]+", "at_s=1", word) for word in words]
+    made = [re.sub(r"\bat_s=[\d.]+", "at_s=1.5", word) for word in words]
     if "--seeds" in made:
         at = made.index("--seeds") + 1
         made[at] = str(min(int(made[at]), SEEDS))
