@@ -102,7 +102,7 @@ class SquareRootEngine:
         """The posterior of the last step, or what the start left behind."""
         return self._posterior or window.prior
 
-    def followed(self, window: Window, level: bool) -> tuple[Window, gtsam.Pose3] | None:
+    def regauged(self, window: Window, level: bool) -> tuple[Window, gtsam.Pose3] | None:
         """The window in the world where the cost of the last step is least, and the motion."""
         posterior = self._posterior
         if posterior is None or posterior.d @ posterior.d < LEAST_GAIN:

@@ -174,7 +174,7 @@ class Engine(Protocol):
         """What the last step knew of the variables, the calibration among them."""
         ...
 
-    def followed(self, window: Window, level: bool) -> tuple[Window, gtsam.Pose3] | None:
+    def regauged(self, window: Window, level: bool) -> tuple[Window, gtsam.Pose3] | None:
         """The window in the world where the cost of the last step is least.
 
         Args:

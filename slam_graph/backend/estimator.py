@@ -363,7 +363,7 @@ class Estimator(EstimatorKnowledge):
         """The state, moved with its world as far as fixes ask for it and the steps did not."""
         if state is None or not self.aiding.aligned:
             return state
-        found = self._engine.followed(window, self.rig.has_imu)
+        found = self._engine.regauged(window, self.rig.has_imu)
         if found is not None:
             self.window, motion = found
             state = self.aiding.in_moved_world(state, motion)

@@ -6,7 +6,7 @@ A run with a wrong calibration may come to its end, with errors that nothing in 
 run is followed by a quick look at the tracks after its start, and one that failed, was not smooth,
 or contradicts that look, by a diagnosis. If that finds a fault in what the run was given, the run
 is `suspect`, whatever it has estimated. A run that does not start is looked at while it waits, and
-one that goes on after 6, 12 and 24 s, when all frames are there that are looked at.
+one that goes on 6, 12 and 24 s after its start. After 24 s all frames are there that are looked at.
 The time offset between camera and IMU is watched over the whole run, as it may change later on.
 """
 

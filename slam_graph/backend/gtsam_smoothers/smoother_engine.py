@@ -79,7 +79,7 @@ class SmootherEngine:
         """What is known of the newest state in the graph."""
         return window.prior
 
-    def followed(self, window: Window, level: bool) -> None:
+    def regauged(self, window: Window, level: bool) -> None:
         """Nothing: what is in the lag is linearised anew, and so follows the fixes by itself."""
 
     def landmarks(self, window: Window) -> tuple[IntArray, FloatArray]:
