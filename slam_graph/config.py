@@ -89,6 +89,9 @@ class LimitsConfig(Settings):
     """Largest plausible speed, m/s."""
     max_position_sigma_m: float = expert(default=100.0, gt=0)
     """Largest standard deviation of the position along any axis."""
+    max_orientation_sigma_rad: float = expert(default=2.0, gt=0)
+    """Largest standard deviation of the orientation about any axis: an angle of which nothing is
+    known has 1.8."""
     max_gyro_bias: float = expert(default=0.5, gt=0)
     """Largest plausible gyroscope bias, rad/s (data sheets of cheap sensors allow 0.35)."""
     max_accel_bias: float = expert(default=3.0, gt=0)

@@ -75,7 +75,7 @@ class Dynamics:
         return ConstantVelocity(
             model_rig(rig, config.dynamics),
             without_prediction(algorithm, rig),
-            without_imu(config, rig.has_scale),
+            without_imu(config, rig.sees_depth),
         )
 
     def extend(self, imu: ImuBuffer, until_ns: int) -> None:
@@ -123,7 +123,7 @@ def model_rig(rig: Rig, config: DynamicsConfig) -> Rig:
     return replace(rig, imu=noise, has_imu=False)
 
 
-def without_imu(config: BackendConfig, has_scale: bool) -> BackendConfig:
+def without_imu(config: BackendConfig, sees_depth: bool) -> BackendConfig:
     """The settings without gravity, and without all that compares images with an IMU.
 
     The gate compares observations with a prediction, which is vague here, so it lets tracks pass
@@ -132,7 +132,7 @@ def without_imu(config: BackendConfig, has_scale: bool) -> BackendConfig:
 
     Args:
         config: the settings.
-        has_scale: whether the cameras measure lengths.
+        sees_depth: whether the images of one time measure lengths.
 
     Raises:
         ConfigError: if a time offset is to be estimated, which wants an IMU.
@@ -146,7 +146,7 @@ def without_imu(config: BackendConfig, has_scale: bool) -> BackendConfig:
         update={"gravity": 0.0, "max_imu_gap_s": _NO_GAP_S, "imu_scale": 1.0}
     )
     gating = config.gating
-    if has_scale and gating.robust_loss is None:
+    if sees_depth and gating.robust_loss is None:
         gating = gating.model_copy(update={"robust_loss": "cauchy"})
     return config.model_copy(
         update={
@@ -171,7 +171,7 @@ def without_prediction(algorithm: AlgorithmConfig, rig: Rig) -> AlgorithmConfig:
     cost, smoother = algorithm.cost, algorithm.smoother
     if cost.max_state_features != 0 and cost.state_feature_frames is None:
         cost = cost.model_copy(update={"state_feature_frames": _STATE_FEATURE_FRAMES})
-    if cost.max_state_features != 0 and rig.has_scale:
+    if cost.max_state_features != 0 and rig.sees_depth:
         more = _MORE_FEATURES if rig.depth is None else _MORE_WITH_DEPTH
         update: dict[str, Any] = {}
         if cost.keep_lost_features is None:

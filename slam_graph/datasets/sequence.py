@@ -33,6 +33,10 @@ from slam_graph.sensors import AidingData, CameraFrame, FeatureFrame, ImuData, P
 
 _HISTORY_NS = 1_000_000_000
 """How much of the IMU before a chosen start the first packet carries."""
+_ASSUMED_MOUNTING = (
+    "where the cameras are mounted is unknown and no IMU tells it: the body is taken for the first "
+    "camera, and lever arms, odometry and known poses are taken to be given in its frame"
+)
 
 
 FrameStream = Generator[CameraFrame | FeatureFrame, None, None]
@@ -180,6 +184,8 @@ class RecordedSequence(ObjectSources, Displayed, ABC):
         self.groundtruth_path: Path | None = None
         self.named_aiding = dict(options.aiding)
         self.diagnostics = options.diagnostics
+        if not self.rig.has_imu and not all(mounted.rotation_known for mounted in rig.cameras):
+            self.diagnostics.warn("mounting_assumed", f"{name}: {_ASSUMED_MOUNTING}")
         rolling = [c.name for c in rig.cameras if c.rolling_shutter and not c.readout_s]
         if rolling:
             what = f"{name}: {', '.join(rolling)}: rows are taken as exposed at one time"

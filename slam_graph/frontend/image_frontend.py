@@ -99,7 +99,7 @@ class ImageFrontend:
             camera, reference = mounted.camera, self._references[i]
             extractor = FeatureExtractor(config, camera.width, camera.height, mask)
             turns = not rig.has_imu and config.prediction in ("gyroscope", "state")
-            seeks = turns and rig.has_scale
+            seeks = turns and rig.sees_depth
             blur = BLUR_PER_PX if seeks else 0.0
             associator: Associator = CornerTracking(extractor, lucas_kanade, config, blur)
             if reference == i:

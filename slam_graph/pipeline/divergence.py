@@ -67,9 +67,10 @@ def check_sane(state: NavState, config: RunConfig) -> None:
     gyro, accel = state.gyro_bias.tolist(), state.accel_bias.tolist()
     if not all(map(math.isfinite, (*pose, *velocity, *gyro, *accel, *variances))):
         raise DivergenceError(f"diverged at frame {state.stamp_ns}: the state is not finite")
-    sigma_m = math.sqrt(max(*variances[3:6], 0.0))
+    sigma_rad, sigma_m = (math.sqrt(max(*v, 0.0)) for v in (variances[:3], variances[3:6]))
     for what, value, limit in (
         ("speed of {} m/s", math.hypot(*velocity), limits.max_speed),
+        ("orientation sigma of {} rad", sigma_rad, limits.max_orientation_sigma_rad),
         ("position sigma of {} m", sigma_m, limits.max_position_sigma_m),
         ("gyroscope bias of {} rad/s", max(map(abs, gyro)), limits.max_gyro_bias),
         ("accelerometer bias of {} m/s²", max(map(abs, accel)), limits.max_accel_bias),

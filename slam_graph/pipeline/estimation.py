@@ -58,8 +58,8 @@ class KnownStart:
             if asked.truth is None:
                 raise DataError(f"{name}: no ground truth to start from; use another mode")
             return KnownStart(truth=asked.truth)
-        if mode not in ("auto", "given") or (mode == "auto" and not asked.rig.has_scale):
-            return KnownStart()  # a state in metres says nothing where all is up to scale
+        if mode not in ("auto", "given") or (mode == "auto" and asked.rig.needs_two_views):
+            return KnownStart()  # a state does not say how far away things are
         state = sequence.initial_state()
         first_ns = asked.start_ns - Estimator.LEAD_NS
         if state is not None and not first_ns <= state.stamp_ns <= asked.end_ns:

@@ -46,8 +46,8 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 _NO_SCALE = (
-    "one camera without an IMU: all lengths are up to scale; "
-    "fixes, known poses and odometry are not used"
+    "one camera without an IMU or odometry: all lengths are up to scale; "
+    "fixes and known poses are not used"
 )
 
 
@@ -209,6 +209,8 @@ def _part_of(sequence: Sequence, config: RunConfig) -> RunInput:
         objects = sequence.object_truth() if config.objects.enabled else {}
         aiding = config.backend.on_the_clock(sequence.aiding)
         of_fixes = is_in_world_of_fixes(truth, aiding, config.backend)
+        measured = config.backend.odometry.enabled and len(aiding.odometry_stamps_ns) > 0
+        rig = replace(rig, has_odometry=measured)
     return RunInput(info, config, rig, start_ns, end_ns, truth, datum, objects, of_fixes)
 
 

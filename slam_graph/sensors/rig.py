@@ -174,12 +174,14 @@ class Rig:
         has_imu: whether there is an IMU; without one, `imu` means nothing.
         depth: what measures the depth of the points that one of the cameras sees; None where
             nothing does.
+        has_odometry: whether the odometry of wheels or legs measures how far the body moves.
     """
 
     cameras: tuple[RigCamera, ...]
     imu: ImuNoise = field(default_factory=ImuNoise)
     has_imu: bool = True
     depth: DepthSensor | None = None
+    has_odometry: bool = False
 
     @property
     def rolling(self) -> bool:
@@ -188,8 +190,18 @@ class Rig:
 
     @property
     def has_scale(self) -> bool:
-        """Whether anything measures lengths: an IMU, a second camera, or depth."""
-        return self.has_imu or len(self.cameras) > 1 or self.depth is not None
+        """Whether anything measures lengths: an IMU, a second camera, depth, or odometry."""
+        return not self.needs_two_views or self.has_odometry
+
+    @property
+    def sees_depth(self) -> bool:
+        """Whether the images of one time measure lengths: by a second camera, or depth."""
+        return len(self.cameras) > 1 or self.depth is not None
+
+    @property
+    def needs_two_views(self) -> bool:
+        """Whether a start takes two views of different times: one camera alone, without an IMU."""
+        return not (self.has_imu or self.sees_depth)
 
     @property
     def scaled_camera(self) -> gtsam.Pose3 | None:

@@ -16,6 +16,7 @@ from dataclasses import replace
 
 import gtsam
 import numpy as np
+from gtsam.symbol_shorthand import V
 
 from slam_graph.arrays import FloatArray
 from slam_graph.backend.aiding.estimated_path import EstimatedPath, variances_of
@@ -150,7 +151,7 @@ class Aiding:
         """Factors of what was measured from one frame to the next.
 
         Args:
-            state: with the poses of both.
+            state: with the poses of both, and the velocity at the last frame.
             frames: indices of the last and the new one.
             stamps_ns: their times.
             known: (6, 6) covariance of the new pose as it is predicted; None if it is not known.
@@ -159,10 +160,11 @@ class Aiding:
         self._data = self._data.within(stamps_ns[0] - _RECEIVED_NS, None)
         first, last = (state.frames.atPose3(pose_key(i)) for i in frames)
         factors: list[gtsam.NonlinearFactor] = []
-        if self._config.odometry.enabled:
-            moved = self._data.odometry_between(*stamps_ns)
-            if moved is not None:
-                factors.append(odometry_factor(frames, moved, self._config.odometry))
+        moved = self.odometry_between(*stamps_ns)
+        if moved is not None:
+            speed = float(np.linalg.norm(state.frames.atVector(V(frames[0]))))
+            way_m = speed * (stamps_ns[1] - stamps_ns[0]) * 1e-9
+            factors.append(odometry_factor(frames, moved, way_m, self._config.odometry))
         if not self.aligned:
             return factors
         unknown = self._follow(state, prior)
@@ -296,6 +298,12 @@ class Aiding:
         along = self._offset_sigma_s * velocity
         return replace(fix, covariance=fix.covariance + np.outer(along, along))
 
+    def odometry_between(self, from_ns: int, to_ns: int) -> tuple[FloatArray, FloatArray] | None:
+        """As `AidingData.odometry_between`; None where odometry is not to be used."""
+        return (
+            self._data.odometry_between(from_ns, to_ns) if self._config.odometry.enabled else None
+        )
+
     def by_odometry(self, before: NavState, predicted: NavState) -> NavState | None:
         """A predicted state where the odometry has it; None without odometry of this time.
 
@@ -303,9 +311,7 @@ class Aiding:
             before: the last state.
             predicted: the new one, by constant velocity.
         """
-        if not self.used or not self._config.odometry.enabled:
-            return None
-        moved = self._data.odometry_between(before.stamp_ns, predicted.stamp_ns)
+        moved = self.odometry_between(before.stamp_ns, predicted.stamp_ns)
         if moved is None:
             return None
         motion = gtsam.Pose3(gtsam.Rot3.Expmap(moved[0]), moved[1])

@@ -14,24 +14,36 @@ _LEAST_ROTATION_RAD, _LEAST_POSITION_M = 1e-4, 1e-3
 """Standard deviations of a motion of no length."""
 
 
+def motion_sigmas(turn_rad: float, way_m: float, config: OdometryConfig) -> FloatArray:
+    """Standard deviations of a motion by odometry: of its rotation (rad) and translation (m), (2,).
+
+    Variances grow with the distance and with the angle of the motion.
+    """
+    root = np.sqrt(way_m)
+    position = config.position_noise * root + config.position_noise_per_rad * turn_rad
+    rotation = config.rotation_noise * root + config.rotation_noise_per_rad * turn_rad
+    return np.array([rotation + _LEAST_ROTATION_RAD, position + _LEAST_POSITION_M])
+
+
 def odometry_factor(
-    frames: tuple[int, int], moved: tuple[FloatArray, FloatArray], config: OdometryConfig
+    frames: tuple[int, int],
+    moved: tuple[FloatArray, FloatArray],
+    way_m: float,
+    config: OdometryConfig,
 ) -> gtsam.NonlinearFactor:
     """The motion between two frames by the odometry.
-
-    Its variances grow with the distance and with the angle of the motion.
 
     Args:
         frames: indices of the earlier and the later one.
         moved: rotation vector (3,) and translation (3,) of the body, in its frame at the first.
-        config: noise.
+        way_m: length of the way as it is estimated. It must not be that of the odometry: a
+            measured way that is too long would count less than one that is too short, and lengths
+            would come out too small by σ² / way² (1 % where σ is a tenth of the way).
+        config: noise; see `motion_sigmas`.
     """
     turn, shift = moved
-    metres, radians = float(np.linalg.norm(shift)), float(np.linalg.norm(turn))
-    position = config.position_noise * np.sqrt(metres) + config.position_noise_per_rad * radians
-    rotation = config.rotation_noise * np.sqrt(metres) + config.rotation_noise_per_rad * radians
-    sigmas = np.repeat([rotation + _LEAST_ROTATION_RAD, position + _LEAST_POSITION_M], 3)
-    noise = gtsam.noiseModel.Diagonal.Sigmas(sigmas)
+    sigmas = motion_sigmas(float(np.linalg.norm(turn)), way_m, config)
+    noise = gtsam.noiseModel.Diagonal.Sigmas(np.repeat(sigmas, 3))
     pose = gtsam.Pose3(gtsam.Rot3.Expmap(turn), shift)
     first, last = (gtsam.symbol("x", frame) for frame in frames)
     return gtsam.BetweenFactorPose3(first, last, pose, noise)

@@ -267,6 +267,7 @@ class Cost:
     def factor_rows(self, layout: Layout) -> FloatArray:
         """Rows [A b] (m, n + 1) of GTSAM's factors: A at first estimates, b at current ones."""
         end, first, now = 0, self.state.first_frames, self.state.frames
+        of_dynamics: list[int] = []
         Ab = np.zeros((sum(factor.dim() for factor in self.factors), layout.size + 1), order="F")
         for factor in self.factors:
             assert isinstance(factor, gtsam.NoiseModelFactor)
@@ -278,8 +279,13 @@ class Cost:
             Ab[rows, layout.indices(jacobian.keys())] = A
             Ab[rows, -1] = -factor.whitenedError(now)
             end = rows.stop
-        known = self.rig.has_scale or self.defines_unit
-        return Ab if known else without_scale(Ab, self.state, layout, self.rig.body_p_camera[0])
+            if isinstance(factor, gtsam.CombinedImuFactor):
+                of_dynamics += range(rows.start, end)
+        if self.rig.needs_two_views and not self.defines_unit:
+            arm, alone = self.rig.body_p_camera[0], len(of_dynamics) == end
+            chosen = slice(None) if alone else of_dynamics
+            Ab[chosen] = without_scale(Ab[chosen], self.state, layout, arm)
+        return Ab
 
     def rows(self, linear: Linearization, layout: Layout) -> list[FloatArray]:
         """Rows [A b] (m, n + 1) of all observations, to be folded in one after the other."""

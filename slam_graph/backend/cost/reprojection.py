@@ -92,7 +92,7 @@ class RigProjection:
         rolling: whether a shutter rolls; observations are then projected from where their rows were
             exposed, by the motions of their frames.
         has_imu: whether an IMU predicts the motion between frames.
-        has_scale: whether anything measures lengths.
+        needs_two_views: whether a single camera sees how far things are, by its motion alone.
         wide: whether a lens sees so much to the side that errors on the plane z = 1 must be
             weighted (`pixel_slopes`).
         calibration_keys: of the parameters of the rig that are variables.
@@ -122,7 +122,7 @@ class RigProjection:
         self.body_R_camera = matrices[:, :3, :3]
         self.body_p_camera = matrices[:, :3, 3]
         self.rolling = rig.rolling
-        self.has_imu, self.has_scale = rig.has_imu, rig.has_scale
+        self.has_imu, self.needs_two_views = rig.has_imu, rig.needs_two_views
         self.wide = any(camera.model.sees_sideways for camera in self.cameras)
         self._distort, self._lenses = _lens_kernel(self.cameras)
         self._rig = rig

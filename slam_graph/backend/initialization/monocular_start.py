@@ -12,17 +12,22 @@ convention sets the unit: the median depth of the points of the two views is
 the last frame is that of the world, and the scale is that in which the points which live on have
 the depths that were estimated, in the mean of their inverses. What the covariances say is relative
 to these: depths and velocity are as uncertain as their ratios.
+
+Odometry of wheels or legs measures lengths: the unit is the metre then, motions of the odometry are
+part of the batch, and the gauge is the pose alone.
 """
 
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 
 import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import L, V, X
 
-from slam_graph.arrays import IntArray
+from slam_graph.arrays import FloatArray, IntArray
+from slam_graph.backend.aiding.odometry_factors import odometry_factor
 from slam_graph.backend.aiding.regauging import gauge_directions
 from slam_graph.backend.cost.cost import Linearization
 from slam_graph.backend.cost.imu_factor import imu_factor
@@ -38,10 +43,11 @@ from slam_graph.backend.initialization.dynamic_refinement import (
     prior_factors,
 )
 from slam_graph.backend.initialization.dynamic_start import StartFrames, StartGuess
+from slam_graph.backend.initialization.odometry_scale import in_metres, motions_by_odometry
 from slam_graph.backend.initialization.segment_joint import moved
 from slam_graph.backend.initialization.start_diagnosis import Refusal
 from slam_graph.backend.initialization.two_views import MIN_POINTS, TwoViews, two_view_motion
-from slam_graph.backend.solve.square_root import SquareRootInformation, triangularize
+from slam_graph.backend.solve.square_root import Layout, SquareRootInformation, triangularize
 from slam_graph.backend.solve.state import State, imu_state_keys
 from slam_graph.backend.visual_motion import ERROR_PX
 from slam_graph.backend.window import Window
@@ -159,11 +165,23 @@ class MonocularStart:
                 return Refusal("fit", "frames between two views that fit their points")
             poses.append(found[0])
         poses.append(last.compose(camera_T_body))
-        return StartGuess(_states(frames.stamps_ns, poses), known)
+        measured = self._in_metres(poses, frames) if self._context.rig.has_odometry else poses
+        if isinstance(measured, Refusal):
+            return measured
+        return StartGuess(_states(frames.stamps_ns, measured), known)
+
+    def _in_metres(
+        self, poses: list[gtsam.Pose3], frames: StartFrames
+    ) -> list[gtsam.Pose3] | Refusal:
+        """Poses in metres by the odometry, or what is missing for that."""
+        motions = motions_by_odometry(self._context, frames.stamps_ns)
+        if motions is None:
+            return Refusal("frames", "odometry of the time between two views")
+        return in_metres(poses, motions, self._context)
 
 
 class ScaleFreeRefinement(DynamicRefinement):
-    """The batch problem of a start without an IMU, whose scale is a convention."""
+    """The batch problem of a start without an IMU, whose scale is a convention or by odometry."""
 
     def __init__(self, context: EngineContext) -> None:
         super().__init__(context, MAX_SCALE_SIGMA)
@@ -172,7 +190,7 @@ class ScaleFreeRefinement(DynamicRefinement):
         """All steps are taken: without an IMU attempts that fail are rare."""
 
     def _factors(self, frames: StartFrames, guess: StartGuess) -> list[gtsam.NonlinearFactor]:
-        """The dynamics from frame to frame, the first pose, and the distance to the last one."""
+        """The dynamics from frame to frame, the first pose, and what holds the scale."""
         params = self._context.propagation.noise.params()
         factors: list[gtsam.NonlinearFactor] = []
         for k, samples in enumerate(frames.imu_between(self._context.imu)):
@@ -184,6 +202,14 @@ class ScaleFreeRefinement(DynamicRefinement):
         covariance[:9, :9] = np.diag(sigmas**2)
         covariance[9:, 9:] = bias_covariance(_RATE_SIGMA)
         factors += prior_factors(replace(first, covariance=covariance))
+        if self._context.rig.has_odometry:
+            motions = motions_by_odometry(self._context, frames.stamps_ns)
+            assert motions is not None, "the guess is made of them"
+            poses = [nav.world_T_body for nav in guess.states]
+            return factors + [
+                odometry_factor((k, k + 1), motion, a.range(b), self._context.config.odometry)
+                for k, (motion, (a, b)) in enumerate(zip(motions, pairwise(poses), strict=True))
+            ]
         distance = first.world_T_body.range(last.world_T_body)
         noise = gtsam.noiseModel.Isotropic.Sigma(1, _SCALE_SIGMA * distance)
         end = len(guess.states) - 1
@@ -198,24 +224,25 @@ class ScaleFreeRefinement(DynamicRefinement):
     def _in_gauge(
         self, prior: SquareRootInformation, state: State, last: int, features: IntArray
     ) -> SquareRootInformation:
-        """The prior with the last pose for known, and the scale (an S-transformation, Baarda)."""
+        """The prior with the last pose for known, and the scale where nothing measures it.
+
+        This is an S-transformation (Baarda 1973).
+        """
         layout, values = prior.layout, state.first
         arm = self._context.rig.cameras[0].body_T_camera.translation()
         centre = values.atPose3(X(last)).transformFrom(arm)
-        free = np.zeros((layout.size + 1, 7))
-        turns = gauge_directions(values, layout, centre, level=False)
-        scale = scale_direction(values, layout, centre, arm)
-        free[:-1] = prior.R @ np.column_stack([turns, scale])
-        rest = triangularize(np.hstack([free, prior.Rd]))[7:, 7:]
-        fixed = np.zeros((7, layout.size + 1))
-        fixed[:6, layout.indices([X(last)])] = np.eye(6) / _POSE_SIGMA
-        held = np.zeros(layout.size)
-        for j in features.tolist():  # mean of the inverse distances, relative to what they are
-            away = values.atPoint3(L(j)) - centre
-            held[layout.indices([L(j)])] = away / np.linalg.norm(away) ** 3
-        if not len(features):
-            held[layout.indices([V(last)])] = scale[layout.indices([V(last)])]
-        fixed[6, :-1] = held / (held @ scale) / _SCALE_SIGMA
+        unmeasured = gauge_directions(values, layout, centre, level=False)
+        fixed = np.zeros((6, layout.size + 1))
+        fixed[:, layout.indices([X(last)])] = np.eye(6) / _POSE_SIGMA
+        if not self._context.rig.has_scale:
+            scale = scale_direction(values, layout, centre, arm)
+            unmeasured = np.column_stack([unmeasured, scale])
+            away = {L(j): values.atPoint3(L(j)) - centre for j in features.tolist()}
+            fixed = np.vstack([fixed, _held_scale(layout, scale, away, V(last))])
+        count = len(fixed)
+        free = np.zeros((layout.size + 1, count))
+        free[:-1] = prior.R @ unmeasured
+        rest = triangularize(np.hstack([free, prior.Rd]))[count:, count:]
         fixed[:, -1] = fixed[:, :-1] @ state.offset(layout)
         return SquareRootInformation(layout, triangularize(np.vstack([rest, fixed])))
 
@@ -227,10 +254,30 @@ class ScaleFreeRefinement(DynamicRefinement):
         if normalized_cost > MAX_NORMALIZED_COST:
             needs = f"frames that fit one another (normalised cost {normalized_cost:.1f})"
             return Refusal("fit", needs)
-        if self.scale_sigma > _MAX_DEPTH_SIGMA:
+        measured = self._context.rig.has_scale
+        if self.scale_sigma > (MAX_SCALE_SIGMA if measured else _MAX_DEPTH_SIGMA):
             needs = f"more parallax (depths are known to {self.scale_sigma:.0%} only)"
             return Refusal("motion", needs)
         return None
+
+
+def _held_scale(
+    layout: Layout, scale: FloatArray, away: dict[int, FloatArray], velocity: int
+) -> FloatArray:
+    """Row (1, n + 1) that holds the mean of the features' inverse distances.
+
+    Args:
+        layout: of the variables.
+        scale: (n,) their tangents when the world is scaled.
+        away: (3,) by key of a feature: where it is from the camera.
+        velocity: key of the velocity, which is held where there is no feature.
+    """
+    held = np.zeros(layout.size + 1)
+    for key, vector in away.items():
+        held[layout.indices([key])] = vector / np.linalg.norm(vector) ** 3
+    if not away:
+        held[layout.indices([velocity])] = scale[layout.indices([velocity])]
+    return np.asarray(held / (held[:-1] @ scale) / _SCALE_SIGMA)[None]
 
 
 def _states(stamps_ns: list[int], poses: list[gtsam.Pose3]) -> list[NavState]:

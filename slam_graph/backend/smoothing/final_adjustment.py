@@ -188,7 +188,7 @@ def _smoothed(log: FrameLog, causal: Trajectory, task: SmoothingTask, report: Re
     if len(keyframes) < _MIN_KEYFRAMES or len(causal) == 0:
         raise _UndeterminedError(f"{len(keyframes)} keyframes are too few")
     longest, began_ns = task.config.max_keyframes, causal.stamps_ns[0]
-    if not task.rig.has_scale:  # nothing predicts the frames before the start well enough
+    if task.rig.needs_two_views:  # nothing predicts the frames before the start well enough
         stamps_ns = log.frames_ns[keyframes] + round(task.rig.pose_offset_s * 1e9)
         keyframes = keyframes[stamps_ns >= began_ns]
         if len(keyframes) < _MIN_KEYFRAMES:

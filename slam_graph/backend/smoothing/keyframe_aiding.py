@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -16,7 +17,7 @@ from slam_graph.backend.aiding.fix_calibration import FixVariables, SeenFixes
 from slam_graph.backend.aiding.fix_factors import Fix, PositionFix, fixes_of, pose_key
 from slam_graph.backend.aiding.odometry_factors import odometry_factor
 from slam_graph.backend.aiding.world_alignment import enough_fixes
-from slam_graph.backend.backend_config import BackendConfig
+from slam_graph.backend.backend_config import BackendConfig, OdometryConfig
 from slam_graph.backend.smoothing.calibrated_fixes import CalibratedFixes
 from slam_graph.geometry import Trajectory, interpolate
 from slam_graph.sensors import AidingData
@@ -83,17 +84,13 @@ def aiding_of_keyframes(
     if not len(data):
         return KeyframeAiding()
     source = data, causal, config, found
-    odometry: list[gtsam.NonlinearFactor] = []
-    for k, ends in enumerate(pairwise(stamps_ns.tolist())):
-        moved = data.odometry_between(*ends) if config.odometry.enabled else None
-        if moved is not None:
-            odometry.append(odometry_factor((k, k + 1), moved, config.odometry))
     near = config.on_the_clock(data).within(int(stamps_ns[0]), int(stamps_ns[-1]))
     measured = fixes_of(near, config, None if found is None else found.lever_arm_m)
     fixes_ns = np.array([fix.stamp_ns for fix in measured], dtype=np.int64)
     middles = stamps_ns[:-1] + np.diff(stamps_ns) // 2
     keyframes = np.searchsorted(middles, fixes_ns).tolist()
     then, at = _poses_at(causal, fixes_ns), _poses_at(causal, stamps_ns)
+    odometry = _odometry(stamps_ns, at, data, config.odometry) if config.odometry.enabled else []
     used: list[Fix] = []
     fixes: list[gtsam.NonlinearFactor] = []
     free: list[tuple[PositionFix, tuple[gtsam.Pose3, gtsam.Pose3], int]] = []
@@ -112,6 +109,31 @@ def aiding_of_keyframes(
     if found is not None and free:
         calibrated = _calibrated(free, causal, FixVariables(config.gnss), found)
     return KeyframeAiding(tuple(fixes), tuple(odometry), source, calibrated)
+
+
+def _odometry(
+    stamps_ns: IntArray,
+    poses: Sequence[gtsam.Pose3 | None],
+    data: AidingData,
+    config: OdometryConfig,
+) -> list[gtsam.NonlinearFactor]:
+    """Factors of the odometry between consecutive keyframes.
+
+    Args:
+        stamps_ns: (K,) of the keyframes.
+        poses: causal ones of them; None where there is none.
+        data: of the recording.
+        config: noise of the odometry.
+    """
+    factors = []
+    for k, (ends, (a, b)) in enumerate(
+        zip(pairwise(stamps_ns.tolist()), pairwise(poses), strict=True)
+    ):
+        moved = data.odometry_between(*ends)
+        if moved is not None:
+            way_m = float(np.linalg.norm(moved[1])) if a is None or b is None else a.range(b)
+            factors.append(odometry_factor((k, k + 1), moved, way_m, config))
+    return factors
 
 
 def _calibrated(

@@ -51,7 +51,7 @@ class SmoothingTask:
             return cls(rig, backend, config, least_noise=least_noise)
         alone = config.model_copy(update={"average_frames": False})  # an IMU would relate them
         rig = model_rig(rig, backend.dynamics)
-        return cls(rig, without_imu(backend, rig.has_scale), alone, least_noise=least_noise)
+        return cls(rig, without_imu(backend, rig.sees_depth), alone, least_noise=least_noise)
 
     @property
     def preintegration(self) -> gtsam.PreintegrationCombinedParams:
