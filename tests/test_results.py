@@ -13,6 +13,7 @@ from typing import cast
 
 import numpy as np
 import pytest
+from flight import rig
 
 from slam_graph.arrays import GrowingTable
 from slam_graph.backend import Estimator
@@ -36,7 +37,6 @@ from slam_graph.results.run_result import RunResult
 from slam_graph.results.saved_run import load_result
 from slam_graph.results.segments import Segment, Segments
 from slam_graph.sensors.measurements import FeatureFrame, FeatureObservations
-from slam_graph.sensors.rig import Rig
 
 NOON = datetime(2026, 3, 4, 12, 0, 0, tzinfo=UTC)
 
@@ -272,7 +272,7 @@ def result_from(truth: Trajectory, estimate: Trajectory) -> RunResult:
     """A result whose states are a trajectory that another system estimated."""
     start, end = int(estimate.stamps_ns[0]), int(estimate.stamps_ns[-1])
     info = SequenceInfo("clip", "euroc", "images", 2, len(estimate), start, end, 0, True)
-    result = RunResult(RunInput(info, load_config(), Rig(()), start, end, truth))
+    result = RunResult(RunInput(info, load_config(), rig(), start, end, truth))
     for index in range(len(estimate)):
         stamp, zero = int(estimate.stamps_ns[index]), np.zeros(3)
         covariance = np.eye(15) * 1e-4
@@ -327,7 +327,7 @@ def test_a_folder_without_a_result_is_refused(tmp_path: Path) -> None:
 
 def test_the_latest_result_of_a_recording_is_read(tmp_path: Path) -> None:
     info = SequenceInfo("clip", "euroc", "images", 1, 0, 0, 0, 0, False)
-    result = RunResult(RunInput(info, load_config(), Rig(()), 0, 10**9))
+    result = RunResult(RunInput(info, load_config(), rig(), 0, 10**9))
     with ResultFolder.of_run(tmp_path, "clip") as made:
         result.save(made.folder)
     folder = made.folder
@@ -347,7 +347,7 @@ def test_a_result_without_states_is_written_too(
 ) -> None:
     caplog.set_level(logging.INFO)
     info = SequenceInfo("clip", "euroc", "images", 1, 0, 0, 0, 0, False)
-    result = RunResult(RunInput(info, load_config(), Rig(()), 0, 10**9))
+    result = RunResult(RunInput(info, load_config(), rig(), 0, 10**9))
     result.save(tmp_path)
     metrics = json.loads((tmp_path / "metrics.json").read_text())
     assert metrics["accuracy"] is None

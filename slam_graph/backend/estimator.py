@@ -104,7 +104,7 @@ class Estimator(EstimatorKnowledge):
         self._held: deque[FeatureFrame] | None = None
         self._measured, self._corrected = True, False
         self._output_ns = self.solved_ns = np.iinfo(np.int64).min
-        self.report, self._single_thread = StepReport(), SingleThread()
+        self.report, self._single_thread, self.times_ns = StepReport(), SingleThread(), {}
         self.rig, self.algorithm, self.config = rig, algorithm, config
         self._variables, self._start_mode = config.calibration, config.initialization.mode
         self.replayed: list[NavState] | None = None
@@ -210,7 +210,8 @@ class Estimator(EstimatorKnowledge):
             has all that were found.
         """
         with self._single_thread.held():
-            self.replayed, self.clock_change, self.report = None, None, StepReport()
+            self.replayed = self.clock_change = None
+            self.report, self.times_ns = StepReport(), {}
             if self._held is None:
                 state = self._take(frame)
                 if self.replayed is None:
@@ -223,7 +224,7 @@ class Estimator(EstimatorKnowledge):
     def finish(self) -> list[NavState]:
         """States at frames that still wait, when no more IMU samples come; in `states` too."""
         with self._single_thread.held():
-            self.replayed = self.clock_change = None
+            self.replayed, self.clock_change, self.times_ns = None, None, {}
             self.states = self._take_held(MAX_EARLY_NS)
             return self.states
 
@@ -251,7 +252,7 @@ class Estimator(EstimatorKnowledge):
             message = f"frame at {frame.stamp_ns} ns does not follow the frames and the IMU"
             self.diagnostics.warn("frame_out_of_order", message)
             return None
-        self._latest_ns = stamp_ns
+        self._latest_ns = self.times_ns[frame.stamp_ns] = stamp_ns
         imu.forget_before(stamp_ns - _HISTORY_NS)
         frame = with_depth_observed(frame, self._real_rig)
         frame, bad = frame.usable(len(self.rig.cameras))
@@ -319,8 +320,7 @@ class Estimator(EstimatorKnowledge):
             offset_ns = round(self.rig_now.cameras[0].clock_offset_s * 1e9)
             if self._held[0].stamp_ns + offset_ns > self._context.imu.newest_ns() + early_ns:
                 break
-            corrected = self.replayed
-            state = self._take(self._held.popleft())
+            corrected, state = self.replayed, self._take(self._held.popleft())
             if self.replayed is not corrected:  # what came before is superseded
                 states = list(self.replayed or ())
             elif state is not None:

@@ -33,6 +33,7 @@ class EstimatorKnowledge:
         rig: the sensors, as calibrated or corrected at the start.
         clock_changes: those that are corrected in the IMU samples.
         report: what is known of the last step besides the state.
+        times_ns: when the states are of the frames that the last call took, by their stamps.
     """
 
     window: Window | None
@@ -40,6 +41,7 @@ class EstimatorKnowledge:
     rig: Rig
     clock_changes: ClockChanges
     report: StepReport
+    times_ns: dict[int, int]
     _real_rig: Rig
     _corrected: bool
     _engine: Engine

@@ -222,7 +222,8 @@ def check_sequence(sequence: Sequence, read_images: bool = False) -> list[Findin
         findings.append(Finding("info", "no IMU", "imu"))
     findings += depths.findings(sequence)
     findings += _check_frames(stamps, name)
-    findings += _check_groundtruth(truth, stamps)
+    offset_ns = round(sequence.rig.pose_offset_s * 1e9)
+    findings += _check_groundtruth(truth, stamps, offset_ns)
     findings += _check_calibration(sequence.rig)
     order: tuple[Severity, ...] = ("error", "warning", "info")
     return sorted(findings, key=lambda found: order.index(found.severity))
@@ -314,7 +315,9 @@ def _check_frames(stamps: IntArray, name: str) -> list[Finding]:
     return findings
 
 
-def _check_groundtruth(truth: Trajectory | None, stamps: IntArray) -> list[Finding]:
+def _check_groundtruth(truth: Trajectory | None, stamps: IntArray, offset_ns: int) -> list[Finding]:
+    """Whether a truth covers the frames, whose times on its clock are later by an offset."""
+    stamps = stamps + offset_ns
     if truth is None:
         return [Finding("info", "no ground truth", "ground truth")]
     first, last = int(truth.stamps_ns[0]), int(truth.stamps_ns[-1])

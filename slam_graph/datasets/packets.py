@@ -50,7 +50,7 @@ def packetize(
     blocks: Iterator[ImuData],
     diagnostics: Diagnostics,
     history_ns: int | None = None,
-    ahead_ns: int = 0,
+    offset_ns: int = 0,
 ) -> Iterator[Packet]:
     """Join frames with the IMU samples that lead up to them.
 
@@ -62,24 +62,23 @@ def packetize(
         blocks: of the IMU stream, with strictly increasing stamps.
         diagnostics: where faults are counted.
         history_ns: how much of the IMU before the first frame its packet carries; None for all.
-        ahead_ns: how far the clock of the IMU is ahead of that of the frames.
+        offset_ns: time of a frame on the clock of the IMU since its stamp. Where it is negative,
+            samples lead up to the stamp all the same.
     """
     feed = _ImuFeed(blocks)
-    previous_ns: int | None = None
+    since = np.zeros(0, np.int64)  # times of the samples after the frame before
     with closing(frames):
-        for frame in frames:
-            held_ns, now_ns = feed.latest_ns, frame.stamp_ns + ahead_ns
-            imu = feed.up_to(now_ns)
-            if previous_ns is None and history_ns is not None:
+        for number, frame in enumerate(frames):
+            now_ns = frame.stamp_ns + offset_ns
+            imu = feed.up_to(max(now_ns, frame.stamp_ns))
+            if number == 0 and history_ns is not None:
                 imu = imu[int(np.searchsorted(imu.stamps_ns, now_ns - history_ns)) :]
-            held = (
-                held_ns is not None and previous_ns is not None and previous_ns < held_ns <= now_ns
-            )
-            if not held and not (len(imu) and imu.stamps_ns[0] <= now_ns):
+            since = np.concatenate([since, imu.stamps_ns])
+            if not len(since) or since[0] > now_ns:
                 diagnostics.warn(
                     "frame_without_imu", f"frame at {frame.stamp_ns} has no IMU samples"
                 )
-            previous_ns = now_ns
+            since = since[np.searchsorted(since, now_ns, side="right") :]
             yield Packet(imu, frame)
 
 

@@ -322,18 +322,21 @@ class RecordedSequence(ObjectSources, Displayed, ABC):
                 up to one second before it. Without it, it carries all samples from the start.
             end_ns: last frame time to deliver.
         """
-        if not self.has_imu:
-            alone = packetize_alone(self.frames(start_ns, end_ns))
-            return with_aiding(alone, self.aiding.within(start_ns, None))
-        after_ns = None if start_ns is None else start_ns - _HISTORY_NS
-        packets = packetize(
-            self.frames(start_ns, end_ns),
-            self.imu_blocks(after_ns),
-            self.diagnostics,
-            None if start_ns is None else _HISTORY_NS,
-            max(0, round(self.rig.end_offset_s * 1e9)),
-        )
-        return with_aiding(packets, self.aiding.within(start_ns, None))
+        frames, rig = self.frames(start_ns, end_ns), self.rig
+        begin_ns = after_ns = None  # on the clock of the states
+        if start_ns is not None:
+            begin_ns = start_ns + round(rig.pose_offset_s * 1e9)
+            after_ns = begin_ns - _HISTORY_NS
+        packets = packetize_alone(frames)
+        if self.has_imu:
+            packets = packetize(
+                frames,
+                self.imu_blocks(after_ns),
+                self.diagnostics,
+                None if start_ns is None else _HISTORY_NS,
+                round(rig.end_offset_s * 1e9),
+            )
+        return with_aiding(packets, self.aiding.within(begin_ns, None), rig)
 
     @cached_property
     def aiding(self) -> AidingData:

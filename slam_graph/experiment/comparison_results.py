@@ -183,7 +183,7 @@ def _error_series(truth: Trajectory, result: RunResult) -> Series:
         true, estimate = (path.mounted(camera) for path in (true, estimate))
     steps = np.linalg.norm(np.diff(true.positions, axis=0), axis=1)
     series: Series = {
-        "time_s": (estimate.stamps_ns - result.input.start_ns) * 1e-9,
+        "time_s": (estimate.stamps_ns - result.input.states_ns[0]) * 1e-9,
         "distance_m": np.concatenate([[0.0], np.cumsum(steps)]),
         "true_path": true.positions,
     }
@@ -207,7 +207,7 @@ def _nees_series(truth: Trajectory, result: RunResult) -> Series:
     except DataError:
         return {}
     return {
-        "nees_time_s": (values.stamps_ns - result.input.start_ns) * 1e-9,
+        "nees_time_s": (values.stamps_ns - result.input.states_ns[0]) * 1e-9,
         "nees_orientation": values.orientation,
         "nees_position": values.position,
         "nees_pose": values.pose,

@@ -74,7 +74,7 @@ class Agreement:
 
         Args:
             estimator: the back end, which has taken the frame.
-            frame: its features.
+            frame: its features, at its time on the clock of the states.
 
         Raises:
             DivergenceError: if velocities were corrected by too much for too long.

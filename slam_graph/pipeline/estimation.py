@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -32,6 +32,11 @@ _TRUTH_SIGMAS = (0.01, 0.01, 0.05, 0.05, 0.01)
 
 _UNKNOWN_BIAS_SIGMAS = (0.2, 0.1)
 """Standard deviations of the accelerometer and gyroscope bias where the truth has none."""
+
+_ODOMETRY_UNUSED = (
+    "the odometry reaches from no frame to the next one: it is on another clock, or its samples "
+    "are more than 0.5 s apart"
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,8 +66,8 @@ class KnownStart:
         if mode not in ("auto", "given") or (mode == "auto" and asked.rig.needs_two_views):
             return KnownStart()  # a state does not say how far away things are
         state = sequence.initial_state()
-        first_ns = asked.start_ns - Estimator.LEAD_NS
-        if state is not None and not first_ns <= state.stamp_ns <= asked.end_ns:
+        first_ns, last_ns = asked.states_ns
+        if state is not None and not first_ns - Estimator.LEAD_NS <= state.stamp_ns <= last_ns:
             state = None
         if state is None and mode == "given":
             raise DataError(
@@ -71,11 +76,14 @@ class KnownStart:
             )
         return KnownStart(state=state)
 
-    def at(self, stamp_ns: int) -> NavState | None:
-        """The state to start from at a frame, or None if it is not known by then."""
+    def at(self, time_ns: int) -> NavState | None:
+        """The state to start from at a time of a frame, or None if it is not known by then.
+
+        The time is on the clock of the states, as those of the truth and of a given state are.
+        """
         if self.truth is not None:
-            return true_state(self.truth, stamp_ns)
-        if self.state is not None and self.state.stamp_ns <= stamp_ns:
+            return true_state(self.truth, time_ns)
+        if self.state is not None and self.state.stamp_ns <= time_ns:
             return self.state
         return None
 
@@ -149,6 +157,7 @@ class Estimation:
             result.input.rig, config.algorithm, config.backend, sequence.diagnostics
         )
         self._start = KnownStart.of(sequence, result.input)
+        self._diagnostics = sequence.diagnostics
         self._recovery = Recovery(result, self.estimator, sequence.diagnostics)
         self._result = result
 
@@ -162,7 +171,7 @@ class Estimation:
         try:
             state = self._solve(tracked)
         except DivergenceError as error:
-            self._start_again(error, tracked.features.stamp_ns)
+            self._start_again(error, tracked.features.stamp_ns + self._recovery.offset_ns)
             state, lost = None, True
         tracked.clock.lap("backend", {k: 1e3 * s for k, s in estimator.report.timings.items()})
         ids, points = estimator.landmarks()
@@ -201,8 +210,11 @@ class Estimation:
         try:
             self._take_last()
         except DivergenceError as error:
-            self._start_again(error, self.estimator.solved_ns)
+            self._start_again(error, self.estimator.solved_ns + self._recovery.offset_ns)
             self._take_last()
+        self._result.logs.by_frame.note_times(self.estimator.times_ns)
+        if self.estimator.aiding.odometry.is_unused:
+            self._diagnostics.warn("odometry_unused", _ODOMETRY_UNUSED)
 
     def _take_last(self) -> None:
         """Note what the frames that still wait lead to."""
@@ -253,9 +265,9 @@ class Estimation:
         result.fix_calibration = estimator.fix_calibration or result.fix_calibration
         result.fix_offset_s = estimator.aiding.offset_s
 
-    def _start_from_known_state(self, stamp_ns: int) -> None:
-        state = self._start.at(stamp_ns)
-        if state is None or stamp_ns - state.stamp_ns > Estimator.LEAD_NS:  # as after a restart
+    def _start_from_known_state(self, time_ns: int) -> None:
+        state = self._start.at(time_ns)
+        if state is None or time_ns - state.stamp_ns > Estimator.LEAD_NS:  # as after a restart
             return
         self.estimator.start(state)
         self._result.start_was_given = True
@@ -268,20 +280,22 @@ class Estimation:
         """
         estimator, features = self.estimator, tracked.features
         stamp_ns = features.stamp_ns
+        time_ns = stamp_ns + self._recovery.offset_ns
         if not estimator.initialized:
-            self._start_from_known_state(tracked.packet.frame.stamp_ns)
+            self._start_from_known_state(time_ns)
         estimator.add_imu(tracked.packet.imu)
         if tracked.packet.aiding is not None and estimator.rig.has_scale:
             estimator.aiding.add(tracked.packet.aiding)
-        self._recovery.check_recorded(stamp_ns)
+        self._recovery.check_recorded(time_ns)
         with _solvable(f"frame {stamp_ns}"):
             state = estimator.add_frame(features)
         self._take_over(estimator.states)
         self._note_fixes()
         if state is not None:
-            self._recovery.agreement.check(stamp_ns, estimator.report.innovations)
+            self._recovery.agreement.check(time_ns, estimator.report.innovations)
             self._recovery.agreement.check_bridging(estimator, state)
-            self._recovery.agreement.check_correction(estimator, features)
+            timed = replace(features, stamp_ns=time_ns)
+            self._recovery.agreement.check_correction(estimator, timed)
         self._recovery.agreement.check_motion(estimator, features, state)
         return state
 
@@ -300,4 +314,5 @@ class Estimation:
                 logs.calibration.append(estimator.calibration)
         estimated = len(frame.landmark_ids)
         logs.by_frame.append(frame.features, estimated, estimator, tracked.frame_stats)
+        logs.by_frame.note_times(estimator.times_ns)
         logs.count_frame(stamp_ns, tracked.clock.milliseconds, tracked.frame_stats)

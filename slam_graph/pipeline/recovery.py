@@ -49,8 +49,13 @@ class Recovery:
 
     @property
     def agreement(self) -> Agreement:
-        """Of the images with the present segment."""
+        """Of the images with the present segment; its times are on the clock of the states."""
         return self._agreement
+
+    @property
+    def offset_ns(self) -> int:
+        """How much later states are than the stamps of their frames, but for an online estimate."""
+        return round(self._estimator.rig.pose_offset_s * 1e9)
 
     def append(self, states: list[NavState]) -> None:
         """Note new states; the first after a start begins a segment."""
@@ -76,11 +81,12 @@ class Recovery:
         self._recent = deque(s for s in self._recent if since_ns and s.stamp_ns < since_ns)
         self.append(states)
 
-    def check_recorded(self, stamp_ns: int) -> None:
+    def check_recorded(self, time_ns: int) -> None:
         """Refuse to go on after a time of which nothing is recorded.
 
         Args:
-            stamp_ns: time of the next frame; the estimator has the samples up to it.
+            time_ns: of the next frame, on the clock of the IMU; the estimator has the samples up to
+                it.
 
         Raises:
             DivergenceError: if neither frames nor samples were recorded for too long.
@@ -90,10 +96,11 @@ class Recovery:
         last_ns = self._recent[-1].stamp_ns
         # all samples, as those before this frame may have come with an earlier one, on any clock
         stamps = self._estimator.imu_stamps_ns
-        between = stamps[(stamps > last_ns) & (stamps < stamp_ns)]
-        times_ns = [last_ns, *between.tolist(), stamp_ns]
+        between = stamps[(stamps > last_ns) & (stamps < time_ns)]
+        times_ns = [last_ns, *between.tolist(), time_ns]
         blind_s = max(later - earlier for earlier, later in pairwise(times_ns)) * 1e-9
         if blind_s > _LONGEST_BLIND_S:
+            stamp_ns = time_ns - self.offset_ns
             message = f"lost at frame {stamp_ns}: nothing was recorded for {blind_s:.1f} s"
             raise DivergenceError(message)
 
@@ -102,7 +109,7 @@ class Recovery:
 
         Args:
             lost: why.
-            noticed_ns: time of the frame at which that was noticed.
+            noticed_ns: time, on the clock of the states, of the frame at which that was noticed.
 
         Raises:
             DivergenceError: the same, if a new start has no prospect or is not wanted.
@@ -138,8 +145,7 @@ class Recovery:
     def _good_until(self, unchanged_ns: int | None) -> int | None:
         """Until when the states of the present segment are good; None if none is.
 
-        Times are on the clock of the IMU, as those of states are. Those of frames, which tests of
-        the gate have, are taken as they are: an offset is small beside the margin.
+        Times are on the clock of the IMU, as those of states are.
 
         Args:
             unchanged_ns: until when the clock was as before, if it has changed.

@@ -183,7 +183,7 @@ class Verdict(Stage):
         """
         lost = bool(self._result.segments.lost)
         if self._waits_since_ns is None:
-            losses = self._result.segments.losses
+            losses = self._losses
             # what the loss was is left out only where it is known when it began
             known = lost and not self._result.segments.lasted
             known = known and bool(losses) and stamp_ns - losses[-1][1] < _FIRST_LOOK_NS
@@ -315,7 +315,7 @@ class Verdict(Stage):
         kept, losses = self._kept, self._result.segments.losses
         frames, imu = kept.frames, kept.imu
         if not across_losses:
-            frames = [f for f in frames if not any(a < f.stamp_ns < b for a, b in losses)]
+            frames = [f for f in frames if not any(a < f.stamp_ns < b for a, b in self._losses)]
             good = np.ones(len(imu), bool)
             for begin_ns, end_ns in losses:
                 good &= (imu.stamps_ns <= begin_ns) | (imu.stamps_ns >= end_ns)
@@ -325,8 +325,13 @@ class Verdict(Stage):
     def _of_tracks(self, rig: Rig, frames: list[FeatureFrame], imu: ImuData) -> Diagnosis:
         from slam_graph.diagnosis import Diagnosis  # it takes a moment to import
 
-        losses = self._result.segments.losses
-        return Diagnosis.of_tracks(rig, frames, imu, self._kept.pairs, losses)
+        return Diagnosis.of_tracks(rig, frames, imu, self._kept.pairs, self._losses)
+
+    @property
+    def _losses(self) -> list[tuple[int, int]]:
+        """Times in which the estimate was lost, on the clock of the frames."""
+        offset_ns = self._result.input.offset_ns
+        return [(a - offset_ns, b - offset_ns) for a, b in self._result.segments.losses]
 
     def _final_rig(self) -> Rig:
         """The rig as calibrated, corrected or estimated, whichever came last."""
@@ -352,4 +357,4 @@ class Verdict(Stage):
         from slam_graph.diagnosis import Diagnosis  # it takes a moment to import
 
         kept = self._kept
-        return Diagnosis.nearby(rig, kept.frames, kept.imu, self._result.segments.losses)
+        return Diagnosis.nearby(rig, kept.frames, kept.imu, self._losses)

@@ -28,6 +28,8 @@ INNOVATION = ("nis", "nis_dof", "nis_expected")
 COSTS = ("cost_before", *(f"cost_after_{k}" for k in range(1, _MAX_COSTS)))
 NEES = ("nees_position", "nees_orientation")
 KEYFRAME = "keyframe"
+STATE = "state_ns"
+"""Times of the states: a column only where they are not the stamps of the frames."""
 _CELLS = (*COUNTS, "features_in_state", *REJECTED, *INNOVATION)
 _WHOLE = (*COUNTS, "features_in_state", *REJECTED, "nis_dof")
 _OF_STATES = [_CELLS.index(name) for name in INNOVATION]
@@ -39,6 +41,7 @@ class FrameTable:
 
     def __init__(self) -> None:
         self._stamps_ns = array("q")
+        self._times_ns = array("q")  # of the states, as far as they are known
         self._cells = GrowingTable(len(_CELLS), np.float32)  # as many digits as are written
         self._costs: list[array[float]] = []  # a column for each, as many as a frame ever had
         self._row_of: dict[int, int] = {}
@@ -73,16 +76,34 @@ class FrameTable:
         self._note_costs(estimator.report.costs[:_MAX_COSTS])
         if window is not None:
             self._row_of = {n: r for n, r in self._row_of.items() if n in window.past}
-            self._row_of[window.frame] = len(self)
+            self._row_of[window.frame] = self._row_solved(estimator.solved_ns, features.stamp_ns)
             self._keyframe_rows |= {self._row_of[n] for n in window.keyframes if n in self._row_of}
+        later_ns = self._times_ns[-1] - self._stamps_ns[-1] if len(self) else 0
+        self._times_ns.append(features.stamp_ns + later_ns)
         self._stamps_ns.append(features.stamp_ns)
 
-    def forget_from(self, stamp_ns: int) -> None:
+    def note_times(self, times_ns: Mapping[int, int]) -> None:
+        """Note when the states at frames are, by the stamps of these.
+
+        The clock of the states is ahead of that of the frames by an offset, which may be estimated
+        on the way. A frame that waits has its state later than others have theirs.
+        """
+        for stamp_ns, time_ns in times_ns.items():
+            row = bisect_left(self._stamps_ns, stamp_ns)
+            if row < len(self) and self._stamps_ns[row] == stamp_ns:
+                self._times_ns[row] = time_ns
+
+    def first_stamp_ns(self, time_ns: int) -> int:
+        """Stamp of the first frame with a state at or after a time; if there is none, any later."""
+        first = bisect_left(self._times_ns, time_ns)
+        return self._stamps_ns[first] if first < len(self) else int(np.iinfo(np.int64).max)
+
+    def forget_from(self, time_ns: int) -> None:
         """Forget what is said of states at and after a time; counts of frames stay.
 
         Frames of the window are numbered anew after this.
         """
-        first = bisect_left(self._stamps_ns, stamp_ns)
+        first = bisect_left(self._times_ns, time_ns)
         self._cells.fill(first, _OF_STATES, math.nan)
         for column in self._costs:
             column[first:] = _UNKNOWN * (len(self) - first)
@@ -95,9 +116,14 @@ class FrameTable:
         return np.array(self._stamps_ns, dtype=np.int64)
 
     @property
+    def times_ns(self) -> IntArray:
+        """(F,) times of the states at the frames, whether there is one or not."""
+        return np.array(self._times_ns, dtype=np.int64)
+
+    @property
     def keyframes_ns(self) -> IntArray:
-        """(K,) times of the frames that the algorithm has made keyframes."""
-        return self.stamps_ns[sorted(self._keyframe_rows)]
+        """(K,) times of the states at the frames that the algorithm has made keyframes."""
+        return self.times_ns[sorted(self._keyframe_rows)]
 
     def csv_lines(
         self, keyframes_ns: IntArray, nees: tuple[IntArray, FloatArray] | None
@@ -105,24 +131,32 @@ class FrameTable:
         """The table as CSV, empty where something is not known.
 
         Args:
-            keyframes_ns: (K,) times of keyframes.
+            keyframes_ns: (K,) times of the states at keyframes.
             nees: times (N,) and NEES (N, 2) of position and orientation, if there is a truth.
         """
-        stamps_ns, table = self.stamps_ns, self._table().astype(np.float64)
+        times_ns, table = self.times_ns, self._table().astype(np.float64)
         errors = np.full((len(self), 2), np.nan)
         if nees is not None:
-            _, rows, found = np.intersect1d(stamps_ns, nees[0], return_indices=True)
+            _, rows, found = np.intersect1d(times_ns, nees[0], return_indices=True)
             errors[rows] = nees[1][found]
         always = len(_CELLS)  # the cost before the steps
         last = max([always, *np.flatnonzero(np.isfinite(table).any(axis=0)).tolist()])
         titles = (*_CELLS, *COSTS)[: last + 1]
-        yield ",".join(["stamp_ns", KEYFRAME, *titles, *NEES]) + "\n"
-        marks = np.isin(stamps_ns, keyframes_ns)
+        marks = np.isin(times_ns, keyframes_ns).astype(np.int64)
+        firsts = {"stamp_ns": self.stamps_ns, STATE: times_ns, KEYFRAME: marks}
+        if self._times_ns == self._stamps_ns:
+            del firsts[STATE]
+        yield ",".join([*firsts, *titles, *NEES]) + "\n"
         whole = [name in _WHOLE for name in titles]
-        for stamp_ns, mark, row, error in zip(stamps_ns, marks, table, errors, strict=True):
+        columns = zip(*(column.tolist() for column in firsts.values()), strict=True)
+        for first, row, error in zip(columns, table, errors, strict=True):
             cells = [_cell(v, w) for v, w in zip(row[: last + 1].tolist(), whole, strict=True)]
             cells += [_cell(value, False) for value in error.tolist()]
-            yield ",".join([str(stamp_ns), str(int(mark)), *cells]) + "\n"
+            yield ",".join([*map(str, first), *cells]) + "\n"
+
+    def _row_solved(self, solved_ns: int, stamp_ns: int) -> int:
+        """The row of the frame that was solved last: the new one's, unless that waits."""
+        return len(self) if solved_ns == stamp_ns else bisect_left(self._stamps_ns, solved_ns)
 
     def _note_costs(self, costs: Sequence[float]) -> None:
         """Note the costs of the next frame; those that it does not have are not known."""

@@ -105,7 +105,7 @@ class LocalizationLog:
         """The table for `metrics.json`.
 
         Args:
-            start_ns: time of the first frame that was asked for.
+            start_ns: time of the state at the first frame that was asked for.
             frames: number of frames that were read.
             truth: the true trajectory, if there is one.
         """

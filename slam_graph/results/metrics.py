@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 
     from slam_graph.backend import FinalBa
     from slam_graph.loop_closure import LoopClosures
+    from slam_graph.results.run_input import RunInput
     from slam_graph.results.run_logs import RunLogs
 
 SCHEMA_VERSION = 3
@@ -118,29 +119,27 @@ def consistency_table(
         return {"unavailable": str(error)}
 
 
-def extent_table(
-    start_ns: int, end_ns: int, frames: int, trajectory: Trajectory, segments: Segments
-) -> Table:
+def extent_table(asked: RunInput, frames: int, trajectory: Trajectory, segments: Segments) -> Table:
     """How much was asked for, read and estimated.
 
     Args:
-        start_ns: first time that was asked for.
-        end_ns: last time that was asked for.
+        asked: the part of a recording that was asked for.
         frames: that were read.
         trajectory: that was estimated.
         segments: its stretches.
     """
     stamps = trajectory.stamps_ns
     started = len(stamps) > 0
+    first_ns, _ = asked.states_ns
     return {
-        "start_ns": start_ns,
-        "end_ns": end_ns,
-        "recorded_s": (end_ns - start_ns) * 1e-9,
+        "start_ns": asked.start_ns,
+        "end_ns": asked.end_ns,
+        "recorded_s": asked.recorded_s,
         "frames": frames,
         "estimated_frames": len(stamps),
         "estimated_s": segments.seconds,
-        "coverage": coverage(start_ns, end_ns, segments),
-        "initialization_s": float(stamps[0] - start_ns) * 1e-9 if started else None,
+        "coverage": coverage(asked.start_ns, asked.end_ns, segments),
+        "initialization_s": float(stamps[0] - first_ns) * 1e-9 if started else None,
     }
 
 

@@ -52,7 +52,7 @@ def _accuracy(errors: _Errors, asked: RunInput) -> dict[str, float | int] | None
     """Errors of motions and poses; None without true poses."""
     if asked.truth is None or not asked.object_truth:
         return None
-    offset_ns = round(asked.rig.pose_offset_s * 1e9)
+    offset_ns = asked.offset_ns
     true_body = replace(asked.truth, stamps_ns=asked.truth.stamps_ns - offset_ns)
     table: dict[str, float | int] = errors(asked.object_truth, true_body).table()
     return table

@@ -27,7 +27,7 @@ class RunInput:
         info: the recording.
         config: all settings.
         rig: the sensors that were used.
-        start_ns, end_ns: times of the first and the last frame that were asked for.
+        start_ns, end_ns: stamps of the first and the last frame that were asked for.
         truth: ground truth of the whole recording, or None.
         object_truth: true poses of moving objects by their numbers.
         datum: latitude, longitude (°) and height (m) of the origin of the fixes, or None.
@@ -43,6 +43,16 @@ class RunInput:
     datum: tuple[float, float, float] | None = None
     object_truth: Mapping[int, Trajectory] = field(default_factory=dict)
     truth_of_fixes: bool = False
+
+    @property
+    def offset_ns(self) -> int:
+        """Time of a state, on its clock, since the stamp of its frame, as it was calibrated."""
+        return round(self.rig.pose_offset_s * 1e9)
+
+    @property
+    def states_ns(self) -> tuple[int, int]:
+        """Times of the states at the first and the last frame."""
+        return self.start_ns + self.offset_ns, self.end_ns + self.offset_ns
 
     @property
     def recorded_s(self) -> float:

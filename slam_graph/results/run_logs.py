@@ -271,11 +271,14 @@ class RunLogs:
         """Forget what is said of states from a time on; times and counts of frames stay.
 
         Args:
-            since_ns: the time; None for all.
+            since_ns: the time, on the clock of the states; None for all.
         """
-        since_ns = np.iinfo(np.int64).min if since_ns is None else since_ns
-        for log in (self.steps, self.innovations, self.calibration, self.by_frame):
-            log.forget_from(since_ns)
+        since_ns = int(np.iinfo(np.int64).min) if since_ns is None else since_ns
+        first_ns = self.by_frame.first_stamp_ns(since_ns)
+        self.steps.forget_from(first_ns)
+        self.innovations.forget_from(first_ns)
+        self.calibration.forget_from(since_ns)
+        self.by_frame.forget_from(since_ns)
 
     def count_frame(
         self, stamp_ns: int, milliseconds: Mapping[str, float], frame_stats: Mapping[str, float]

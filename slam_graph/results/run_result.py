@@ -198,7 +198,7 @@ class RunResult(RunSummary):
 
     @property
     def keyframes_ns(self) -> IntArray:
-        """(K,) times of the keyframes of the algorithm; else of loop closure, else of the map."""
+        """(K,) times of the states at the keyframes: of the algorithm, loop closure or the map."""
         own = self.logs.by_frame.keyframes_ns
         if len(own):
             return own
@@ -237,8 +237,9 @@ class RunResult(RunSummary):
         truth = self.input.truth
         if truth is None:
             return None
-        first, last = self.input.start_ns - _TRUTH_MARGIN_NS, self.input.end_ns + _TRUTH_MARGIN_NS
-        near = (truth.stamps_ns >= first) & (truth.stamps_ns <= last)
+        first, last = self.input.states_ns
+        near = truth.stamps_ns >= first - _TRUTH_MARGIN_NS
+        near &= truth.stamps_ns <= last + _TRUTH_MARGIN_NS
         return truth.select(near) if near.any() else None
 
     @property
@@ -250,9 +251,7 @@ class RunResult(RunSummary):
     def metrics(self) -> dict[str, Any]:
         """The content of `metrics.json`; computed when it is first asked for."""
         asked, logs, truth = self.input, self.logs, self.groundtruth
-        extent = tables.extent_table(
-            asked.start_ns, asked.end_ns, logs.frames, self.trajectory, self.segments
-        )
+        extent = tables.extent_table(asked, logs.frames, self.trajectory, self.segments)
         frames = max(logs.frames, 1)
         located = self.localization
         table: dict[str, Any] = tables.finite(
@@ -286,7 +285,7 @@ class RunResult(RunSummary):
                 "localization": (
                     None
                     if located is None
-                    else located.table(asked.start_ns, logs.frames, asked.truth)
+                    else located.table(asked.states_ns[0], logs.frames, asked.truth)
                 ),
                 "moving_objects": objects_table(self.objects, asked),
                 "nees": tables.consistency_table(

@@ -17,7 +17,7 @@ from slam_graph.datasets import read_kalibr
 from slam_graph.errors import DataError
 from slam_graph.geometry import AlignmentMode, Trajectory
 from slam_graph.results import result_files as names
-from slam_graph.results.frame_table import KEYFRAME, NEES
+from slam_graph.results.frame_table import KEYFRAME, NEES, STATE
 from slam_graph.results.map_output import load_map, read_ply
 from slam_graph.results.result_files import LATEST, MAP_NAME
 from slam_graph.results.run_picture import (
@@ -207,9 +207,11 @@ class SavedRun(RunSummary):
 
     @property
     def keyframes_ns(self) -> IntArray:
-        """(K,) times of the keyframes."""
+        """(K,) times of the states at the keyframes."""
         table = self.by_frame
-        return table["stamp_ns"][table[KEYFRAME] == 1] if table else np.zeros(0, np.int64)
+        if not table:
+            return np.zeros(0, np.int64)
+        return np.unique(table.get(STATE, table["stamp_ns"])[table[KEYFRAME] == 1])
 
     @property
     def nees_series(self) -> tuple[IntArray, FloatArray] | None:
@@ -218,7 +220,9 @@ class SavedRun(RunSummary):
             return None
         values = _columns(self.by_frame, NEES)
         known = np.isfinite(values).all(axis=1)
-        return (self.by_frame["stamp_ns"][known], values[known]) if known.any() else None
+        times_ns = self.by_frame.get(STATE, self.by_frame["stamp_ns"])[known]
+        times_ns, rows = np.unique(times_ns, return_index=True)
+        return (times_ns, values[known][rows]) if known.any() else None
 
     @cached_property
     def in_map(self) -> Trajectory | None:

@@ -108,9 +108,9 @@ class Segments:
 
     Attributes:
         lost: why the estimate was lost, the last time that it was; empty if it never was.
-        losses: times of which it is not known what happened, ns: from the last good state before
-            each loss to where that was noticed, whether the run went on or not. A segment from
-            which nothing was good adds none.
+        losses: times of which it is not known what happened, ns, on the clock of the states: from
+            the last good state before each loss to where that was noticed, whether the run went on
+            or not. A segment from which nothing was good adds none.
         SHORT_S: a segment that lasts less is short: a wrong calibration may be what ends it.
     """
 

@@ -33,7 +33,7 @@ from slam_graph.backend.aiding.fix_factors import (
     pose_between,
     pose_key,
 )
-from slam_graph.backend.aiding.odometry_factors import odometry_factor
+from slam_graph.backend.aiding.odometry_factors import OdometryFactors
 from slam_graph.backend.aiding.world_alignment import WorldAlignment, align_world
 from slam_graph.backend.backend_config import BackendConfig
 from slam_graph.backend.solve.square_root import SquareRootInformation
@@ -75,6 +75,7 @@ class Aiding:
         aligned: whether the world is that of the fixes.
         used: whether there was anything to take so far.
         gates: of the sources of fixes, by name.
+        odometry: of wheels or legs.
         offset_s: time offset: added to the times of position fixes, beyond the given one.
         lever_arm_m: (3,) of the position fixes, body frame.
         variables: lever arm and clock, as far as they are estimated with the states; None if
@@ -88,6 +89,7 @@ class Aiding:
         self.lever_arm_m = np.array(config.gnss.lever_arm_m)
         self._data = AidingData.empty()  # by the given offsets of time alone
         self.gates: defaultdict[str, FixGate] = defaultdict(FixGate)
+        self.odometry = OdometryFactors(config.odometry)
         self.used, self.offset_s, self._offset_sigma_s = False, 0.0, 0.0
         self._shifted_s = 0.0  # added to the times of fixes that wait
         self._revised_ns = int(np.iinfo(np.int64).min) // 2  # never
@@ -123,6 +125,7 @@ class Aiding:
         if not self._path.states:
             self._forget_before(data)
         self._data = AidingData.concatenate([self._data, data])
+        self.odometry.data = self._data
         self._waiting = AidingData.concatenate([self._waiting, self._shifted(data)])
 
     def _forget_before(self, data: AidingData) -> None:
@@ -157,14 +160,10 @@ class Aiding:
             known: (6, 6) covariance of the new pose as it is predicted; None if it is not known.
             prior: on the variables up to the last frame, if lever arm or clock are among them.
         """
-        self._data = self._data.within(stamps_ns[0] - _RECEIVED_NS, None)
+        self._data = self.odometry.data = self._data.within(stamps_ns[0] - _RECEIVED_NS, None)
         first, last = (state.frames.atPose3(pose_key(i)) for i in frames)
-        factors: list[gtsam.NonlinearFactor] = []
-        moved = self.odometry_between(*stamps_ns)
-        if moved is not None:
-            speed = float(np.linalg.norm(state.frames.atVector(V(frames[0]))))
-            way_m = speed * (stamps_ns[1] - stamps_ns[0]) * 1e-9
-            factors.append(odometry_factor(frames, moved, way_m, self._config.odometry))
+        speed = float(np.linalg.norm(state.frames.atVector(V(frames[0]))))
+        factors = self.odometry.factors(frames, stamps_ns, speed)
         if not self.aligned:
             return factors
         unknown = self._follow(state, prior)
@@ -298,12 +297,6 @@ class Aiding:
         along = self._offset_sigma_s * velocity
         return replace(fix, covariance=fix.covariance + np.outer(along, along))
 
-    def odometry_between(self, from_ns: int, to_ns: int) -> tuple[FloatArray, FloatArray] | None:
-        """As `AidingData.odometry_between`; None where odometry is not to be used."""
-        return (
-            self._data.odometry_between(from_ns, to_ns) if self._config.odometry.enabled else None
-        )
-
     def by_odometry(self, before: NavState, predicted: NavState) -> NavState | None:
         """A predicted state where the odometry has it; None without odometry of this time.
 
@@ -311,7 +304,7 @@ class Aiding:
             before: the last state.
             predicted: the new one, by constant velocity.
         """
-        moved = self.odometry_between(before.stamp_ns, predicted.stamp_ns)
+        moved = self.odometry.between(before.stamp_ns, predicted.stamp_ns)
         if moved is None:
             return None
         motion = gtsam.Pose3(gtsam.Rot3.Expmap(moved[0]), moved[1])

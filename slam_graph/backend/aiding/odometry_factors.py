@@ -9,6 +9,7 @@ import numpy as np
 
 from slam_graph.arrays import FloatArray
 from slam_graph.backend.backend_config import OdometryConfig
+from slam_graph.sensors import AidingData
 
 _LEAST_ROTATION_RAD, _LEAST_POSITION_M = 1e-4, 1e-3
 """Standard deviations of a motion of no length."""
@@ -47,3 +48,43 @@ def odometry_factor(
     pose = gtsam.Pose3(gtsam.Rot3.Expmap(turn), shift)
     first, last = (gtsam.symbol("x", frame) for frame in frames)
     return gtsam.BetweenFactorPose3(first, last, pose, noise)
+
+
+class OdometryFactors:
+    """Makes factors of the odometry from frame to frame.
+
+    Attributes:
+        data: what was received of the last seconds.
+    """
+
+    def __init__(self, config: OdometryConfig) -> None:
+        self._config, self.data = config, AidingData.empty()
+        self._came, self._asked, self._used = False, False, False
+
+    @property
+    def is_unused(self) -> bool:
+        """Whether there was odometry, and none from any frame to the next."""
+        return self._came and self._asked and not self._used
+
+    def between(self, from_ns: int, to_ns: int) -> tuple[FloatArray, FloatArray] | None:
+        """As `AidingData.odometry_between`; None where odometry is not to be used."""
+        return self.data.odometry_between(from_ns, to_ns) if self._config.enabled else None
+
+    def factors(
+        self, frames: tuple[int, int], stamps_ns: tuple[int, int], speed: float
+    ) -> list[gtsam.NonlinearFactor]:
+        """The motion from one frame to the next, if the odometry has it.
+
+        Args:
+            frames: indices of the earlier and the later one.
+            stamps_ns: their times.
+            speed: at the earlier one, as it is estimated, m/s.
+        """
+        moved = self.between(*stamps_ns)
+        self._came |= len(self.data.odometry_stamps_ns) > 0
+        self._asked |= self._config.enabled
+        if moved is None:
+            return []
+        self._used = True
+        way_m = speed * (stamps_ns[1] - stamps_ns[0]) * 1e-9
+        return [odometry_factor(frames, moved, way_m, self._config)]

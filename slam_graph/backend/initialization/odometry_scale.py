@@ -27,7 +27,7 @@ def motions_by_odometry(context: EngineContext, stamps_ns: Sequence[int]) -> lis
     aiding = context.propagation.aiding
     if aiding is None:
         return None
-    motions = [aiding.odometry_between(*ends) for ends in pairwise(stamps_ns)]
+    motions = [aiding.odometry.between(*ends) for ends in pairwise(stamps_ns)]
     known = [motion for motion in motions if motion is not None]
     return known if len(known) == len(motions) else None
 

@@ -35,7 +35,7 @@ from slam_graph.datasets.streams.vector_lengths import lengths_of
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import DataError
 from slam_graph.files import Files
-from slam_graph.sensors import AidingData, Packet
+from slam_graph.sensors import AidingData, Packet, Rig
 
 FIXES, ODOMETRY, POSES = "gnss.csv", "odometry.csv", "poses.csv"
 
@@ -359,16 +359,29 @@ def _rows(stamps_ns: IntArray, numbers: FloatArray) -> list[str]:
     return [",".join([str(stamp), *map(repr, row)]) for stamp, row in pairs]
 
 
-def with_aiding(packets: Iterator[Packet], data: AidingData) -> Iterator[Packet]:
-    """Packets that carry what was measured up to their frames; unchanged if there is nothing."""
+def with_aiding(packets: Iterator[Packet], data: AidingData, rig: Rig) -> Iterator[Packet]:
+    """Packets that carry what was measured up to the states of their frames.
+
+    Unchanged if there is nothing. Odometry is interpolated, so it goes on to the first sample at or
+    after the state. The state is no later than the last row of the frame or the last sample of the
+    IMU, however the time offset is estimated.
+
+    Args:
+        packets: in the order of time.
+        data: on the clock of the states.
+        rig: tells how much later than the stamp of its frame a state is.
+    """
     if not len(data):
         yield from packets
         return
-    fixes_ns = odometry_ns = None
+    pose_ns, end_ns = (round(1e9 * s) for s in (rig.pose_offset_s, rig.end_offset_s))
+    fixes_ns = odometry_ns = latest_ns = None
     for packet in packets:
-        stamp_ns = packet.frame.stamp_ns
-        beyond = int(np.searchsorted(data.odometry_stamps_ns, stamp_ns))
-        until_ns = stamp_ns
+        stamp_ns = packet.frame.stamp_ns + pose_ns
+        reached = [packet.frame.stamp_ns + end_ns, *packet.imu.stamps_ns[-1:].tolist()]
+        latest_ns = max(reached if latest_ns is None else [latest_ns, *reached])
+        beyond = int(np.searchsorted(data.odometry_stamps_ns, latest_ns))
+        until_ns = latest_ns
         if beyond < len(data.odometry_stamps_ns):
             until_ns = int(data.odometry_stamps_ns[beyond])
         fixes, odometry = data.within(fixes_ns, stamp_ns), data.within(odometry_ns, until_ns)
