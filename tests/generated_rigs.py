@@ -43,14 +43,14 @@ def cameras(draw: st.DrawFn, size: tuple[int, int] | None = None) -> Camera:
 @st.composite
 def rigs(draw: st.DrawFn, most: int = 3, size: tuple[int, int] | None = None) -> Rig:
     """Rigs of one to a few cameras, some with a rolling shutter."""
-    mounted = []
-    for k in range(draw(st.integers(1, most))):
+    mounted, known = [], draw(st.booleans())
+    for _ in range(draw(st.integers(1, most))):
         one = RigCamera(
             draw(cameras(size)),
             draw(poses()),
             draw(finite(MAX_OFFSET_S)),
             draw(NAMES),
-            rotation_known=k > 0 or draw(st.booleans()),
+            rotation_known=known,
         )
         if draw(st.booleans()):
             readout, row = (
@@ -79,14 +79,13 @@ def same_rig(found: Rig, written: Rig, of_kalibr: bool) -> None:
         for name in ("rolling_shutter", "readout_s", "stamped_row"):
             assert getattr(mine, name) == getattr(its, name)
         assert mine.name == (its.name if of_kalibr else f"cam{k}")
-        if of_kalibr:
-            assert mine.rotation_known == its.rotation_known
-        if its.rotation_known or not of_kalibr:
-            wanted, size = (
-                its.body_T_camera.matrix(),
-                1.0 + np.abs(its.body_T_camera.matrix()).max(),
-            )
-            np.testing.assert_allclose(mine.body_T_camera.matrix(), wanted, atol=1e-12 * size)
+        assert mine.rotation_known == its.rotation_known
+        wanted = its.body_T_camera
+        size = 1.0 + np.abs([wanted.matrix(), written.cameras[0].body_T_camera.matrix()]).max()
+        if of_kalibr and not its.rotation_known:  # nothing but the mounting on the first one
+            wanted = written.cameras[0].body_T_camera.between(wanted)
+        found_pose = mine.body_T_camera.matrix()
+        np.testing.assert_allclose(found_pose, wanted.matrix(), atol=1e-12 * size)
 
 
 def frame_stamps(least: int = 10**9, end: int = 2**62 - 10**9) -> st.SearchStrategy[np.ndarray]:

@@ -18,6 +18,8 @@ CHAIN = """cam0:
   distortion_model: radtan
   distortion_coeffs: [-0.28, 0.07, 2.0e-4, 1.7e-05]
   resolution: [64, 48]
+imu0: {accelerometer_noise_density: 2.0e-3, accelerometer_random_walk: 3.0e-3,
+       gyroscope_noise_density: 1.6968e-4, gyroscope_random_walk: 1.9393e-5, update_rate: 200}
 """
 
 STAMPS_NS = [START_NS + k * FRAME_PERIOD_NS for k in range(8)]

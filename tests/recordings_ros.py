@@ -94,6 +94,7 @@ class BagWriter:
         k3: float = 0.0,
         camera: Camera | None = None,
         size: tuple[int, int] = SIZE,
+        R: Any = np.eye(3),  # noqa: B008 - read only
     ) -> Any:
         """Of a camera with distortion `radtan`, by default of the small made-up one."""
         fx, fy, cx, cy = INTRINSICS if camera is None else camera.intrinsics.tolist()
@@ -102,7 +103,7 @@ class BagWriter:
         K = np.array([fx, 0, cx, 0, fy, cy, 0, 0, 1.0])
         P = np.array([fx, 0, cx, 0, 0, fy, cy, 0, 0, 0, 1.0, 0])
         region = self.make("sensor_msgs/msg/RegionOfInterest", 0, 0, 0, 0, False)
-        matrices = (np.array([*distortion, k3]), K, np.eye(3).ravel(), P)
+        matrices = (np.array([*distortion, k3]), K, np.array(R, np.float64).ravel(), P)
         header = self.header(stamp_ns, frame)
         model = (height, width, "plumb_bob")
         return self.make("sensor_msgs/msg/CameraInfo", header, *model, *matrices, 0, 0, region)

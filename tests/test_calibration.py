@@ -8,12 +8,15 @@ import gtsam
 import numpy as np
 import pytest
 import yaml
-from recordings import edit_text, write_euroc
+from recordings import edit_text, write_euroc, write_openvins
+from recordings_loose import CHAIN as LOOSE_CHAIN
+from recordings_loose import write_image_folder
 
 from slam_graph.datasets.calibration.calibration_yaml import read_yaml
 from slam_graph.datasets.calibration.euroc_calibration import read_euroc_rig
 from slam_graph.datasets.calibration.kalibr_calibration import read_kalibr, write_kalibr
 from slam_graph.datasets.dataset_registry import open_dataset
+from slam_graph.datasets.formats.track_recorder import TrackRecorder
 from slam_graph.errors import DataError
 from slam_graph.sensors.camera import Camera
 from slam_graph.sensors.rig import ImuNoise, Rig, RigCamera
@@ -145,6 +148,95 @@ def test_kalibr_chain(chain: Path) -> None:
     between = first.body_T_camera.between(second.body_T_camera)
     np.testing.assert_allclose(between.translation(), [0.1, 0, 0], atol=1e-15)
     assert rig.imu == ImuNoise()
+
+
+@pytest.mark.parametrize("first", ["T_cam_imu", "unknown", "nothing"])
+def test_a_baseline_is_that_of_its_link_whatever_is_known_of_the_imu(
+    chain: Path, first: str
+) -> None:
+    """Kalibr gives both cameras the pose of the IMU, and the second one its link."""
+    content = yaml.safe_load(CHAIN)
+    link = np.array(content["cam1"]["T_cn_cnm1"])
+    content["cam1"]["T_cam_imu"] = (link @ content["cam0"]["T_cam_imu"]).tolist()
+    if first == "unknown":
+        content["cam0"]["T_cam_imu"] = "unknown"
+    elif first == "nothing":
+        del content["cam0"]["T_cam_imu"]
+    chain.write_text(yaml.safe_dump(content))
+    rig = read_kalibr(chain, needs_imu=first != "nothing")
+    left, right = rig.cameras
+    between = right.body_T_camera.between(left.body_T_camera)
+    np.testing.assert_allclose(between.matrix(), link, atol=1e-12)
+    assert left.rotation_known is right.rotation_known is (first != "unknown")
+    write_kalibr(rig, chain)
+    assert same(read_kalibr(chain), rig)
+    del content["cam1"]["T_cn_cnm1"]
+    chain.write_text(yaml.safe_dump(content))
+    if first != "T_cam_imu":
+        with pytest.raises(
+            DataError, match=r"yaml:\d+: cam1: missing key 'T_cn_cnm1', .* does not"
+        ):
+            read_kalibr(chain, needs_imu=first != "nothing")
+
+
+def test_a_link_is_from_the_camera_before(chain: Path) -> None:
+    edit_text(chain, "cam1:", "cam2:")
+    with pytest.raises(
+        DataError, match=r"yaml:\d+: T_cn_cnm1: is from the camera before.*no camera"
+    ):
+        read_kalibr(chain)
+    content = yaml.safe_load(chain.read_text())
+    content["cam2"]["T_cam_imu"] = np.eye(4).tolist()
+    chain.write_text(yaml.safe_dump(content))
+    assert read_kalibr(chain).cameras[1].body_T_camera.equals(gtsam.Pose3(), 1e-12)
+
+
+EYE, OFF = np.eye(3).tolist(), [[1.02, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "model: scale-misalignment",
+        "time_offset: 0.25",
+        "T_i_b: [[1, 0, 0, 0.1], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]",
+        f"accelerometers: {{M: {OFF}}}",
+        f"gyroscopes: {{M: {OFF}}}",
+        f"gyroscopes: {{M: {EYE}, A: {EYE}}}",
+        "gyroscopes: {C_gyro_i: [[0, 1, 0], [-1, 0, 0], [0, 0, 1]]}",
+    ],
+)
+def test_an_imu_whose_samples_need_correction_is_refused(
+    chain: Path, tmp_path: Path, line: str
+) -> None:
+    (tmp_path / "imu.yaml").write_text(f"{IMU}{line}\n")
+    with pytest.raises(DataError, match=r"imu\.yaml:7: .*not corrected by it") as error:
+        read_kalibr(chain)
+    assert "\n" not in str(error.value)
+
+
+def test_an_imu_that_kalibr_takes_as_calibrated_is_read(chain: Path, tmp_path: Path) -> None:
+    neutral = f"accelerometers: {{M: {EYE}}}\ngyroscopes: {{M: {EYE}, C_gyro_i: {EYE}}}\n"
+    rest = f"model: calibrated\ntime_offset: 0.0\nT_i_b: {np.eye(4).tolist()}\n"
+    (tmp_path / "imu.yaml").write_text(IMU + neutral + rest)
+    assert read_kalibr(chain).imu == ImuNoise(3e-4, 4e-5, 1e-3, 2e-4, 200.0)
+
+
+def test_the_noise_of_a_recording_outlives_another_calibration(chain: Path, tmp_path: Path) -> None:
+    """The chain knows nothing of the IMU; where the recording does not either, it is said."""
+    simulated = open_dataset(write_openvins(tmp_path / "simulated"))
+    noise = ImuNoise(1e-2, 1e-3, 0.1, 1e-2, 100.0)
+    with TrackRecorder(tmp_path / "tracks", Rig(simulated.rig.cameras, noise)) as recorder:
+        for packet in simulated.packets():
+            recorder.write(packet.imu, packet.frame)
+    for name, expected in (("simulated", simulated.rig.imu), ("tracks", noise)):
+        sequence = open_dataset(tmp_path / name, calibration=chain)
+        assert sequence.rig.imu == expected
+        assert not sequence.diagnostics.counts
+    images = write_image_folder(tmp_path / "images")
+    (images / "calibration.yaml").write_text(LOOSE_CHAIN.partition("imu0:")[0])
+    assert open_dataset(images).diagnostics.counts == {"imu_noise_assumed": 1}
+    assert not open_dataset(images, imu=False).diagnostics.counts
 
 
 def test_imu_noise_of_kalibr(chain: Path, tmp_path: Path) -> None:

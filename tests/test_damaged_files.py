@@ -137,7 +137,7 @@ cam1:
   resolution: [640, 480]
   timeshift_cam_imu: 0.01
 cam2:
-  T_cam_imu: [[1, 0, 0, 0.3], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
+  T_cn_cnm1: [[1, 0, 0, 0.3], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
   camera_model: pinhole
   intrinsics: [300, 301, 320, 240]
   distortion_coeffs: [-0.01, 0.02, -0.003, 0.001]

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+import gtsam
 import numpy as np
 import pytest
 from recordings import FRAME_PERIOD_NS, START_NS, edit_text, write_euroc, write_openvins
@@ -170,3 +171,37 @@ def test_a_real_bag_and_its_conversion_give_the_same_trajectory(
     assert np.array_equal(before.stamps_ns, after.stamps_ns)
     np.testing.assert_allclose(after.positions, before.positions, atol=1e-6)
     np.testing.assert_allclose(after.quaternions, before.quaternions, atol=1e-6)
+
+
+def test_an_unknown_mounting_stays_unknown(tmp_path: Path) -> None:
+    source, chain = write_euroc(tmp_path / "flight"), tmp_path / "chain.yaml"
+    rig = open_dataset(source).rig
+    first, second = (replace(camera, rotation_known=False) for camera in rig.cameras)
+    moved = replace(second, body_T_camera=first.body_T_camera.between(second.body_T_camera))
+    write_kalibr(Rig((replace(first, body_T_camera=gtsam.Pose3()), moved), rig.imu), chain)
+    before = open_dataset(source, calibration=chain)
+    EurocWriter.convert(before, tmp_path / "new")
+    after = open_dataset(tmp_path / "new")
+    same_rig(after.rig, before.rig)
+    assert [camera.rotation_known for camera in after.rig.cameras] == [False, False]
+
+
+def test_masks_and_true_objects_come_along(tmp_path: Path) -> None:
+    source = write_euroc(tmp_path / "flight", skew_ns=0)
+    stamps = [START_NS + k * FRAME_PERIOD_NS for k in range(8)]
+    (source / "masks").mkdir()
+    boxes = "".join(f"{stamp + 300},7,{k},2,20,30\n" for k, stamp in enumerate(stamps[:6]))
+    (source / "masks" / "boxes.csv").write_text(boxes)
+    (source / "masks" / "classes.csv").write_text("7,car\n")
+    (source / "objects_truth.csv").write_text(f"#t\n{stamps[0]},3,1,2,3,0,0,0,1\n")
+    before = open_dataset(source)
+    EurocWriter.convert(before, tmp_path / "new")
+    after = open_dataset(tmp_path / "new")
+    assert (after.masks, after.mask_classes) == (6, {7: "car"})
+    for stamp in stamps:
+        found, expected = after.label_image(stamp), before.label_image(stamp)
+        assert (found is None) == (expected is None)
+        np.testing.assert_array_equal(found, expected)
+    truth = after.object_truth()
+    assert list(truth) == [3]
+    assert truth[3].positions.tolist() == [[1.0, 2.0, 3.0]]

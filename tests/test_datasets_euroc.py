@@ -15,7 +15,9 @@ from recordings import (
     edit_line,
     edit_text,
     write_euroc,
+    write_groundtruth,
     write_imu,
+    write_lines,
 )
 
 from slam_graph.datasets.calibration.kalibr_calibration import write_kalibr
@@ -314,3 +316,23 @@ def test_inertial_recordings_open_without_images(data_dir: Path) -> None:
     assert (info.frames, info.imu_samples, len(truth)) == (0, 22621, 22401)
     assert (info.start_ns, info.end_ns) == (imu.stamps_ns[0], imu.stamps_ns[-1])
     assert list(sequence.packets()) == []
+
+
+@pytest.mark.parametrize("count", [1, 2, 3])
+@pytest.mark.parametrize("at", [0, 500, 1021, 1022, 1023, 1024, 2040])
+def test_stamps_from_the_future_cost_themselves_only(folder: Path, at: int, count: int) -> None:
+    """Wherever they are in the blocks in which a file is read."""
+    write_imu(folder / "mav0", START_NS - 20 * IMU_PERIOD_NS, 2100)
+    write_groundtruth(folder / "mav0", 7, 2100)
+    for name in ("imu0", "state_groundtruth_estimate0"):
+        path = folder / "mav0" / name / "data.csv"
+        lines = path.read_text().splitlines()
+        for k in range(at + 1, at + 1 + count):
+            stamp, _, rest = lines[k].partition(",")
+            lines[k] = f"{int(stamp) + 100 * 10**9},{rest}"
+        write_lines(path, lines)
+    sequence, _ = run_through(folder)
+    truth = sequence.groundtruth()
+    assert truth is not None
+    assert (len(sequence.imu()), len(truth)) == (2100 - count, 2100 - count)
+    assert sequence.diagnostics.counts["groundtruth_out_of_order"] == count

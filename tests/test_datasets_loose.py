@@ -209,6 +209,51 @@ def test_images_without_times_need_a_rate(tmp_path: Path) -> None:
     assert [frame.stamp_ns for frame in frames] == [k * FRAME_PERIOD_NS for k in range(8)]
 
 
+def write_three_folders(path: Path) -> Path:
+    """Images of two cameras and depth, without times, that tell their number."""
+    for name, unit in (("left", np.uint8(1)), ("right", np.uint8(1)), ("depth", np.uint16(100))):
+        (path / name).mkdir(parents=True)
+        for k in range(10):
+            image = np.full((SIZE[1], SIZE[0]), (k + 1) * unit, unit.dtype)
+            cv2.imwrite(str(path / name / f"{k}.png"), image)
+    first, _, noise = WITHOUT_IMU.partition("imu0:")
+    second = first.replace("cam0:", f"cam1:\n  T_cn_cnm1: {np.eye(4).tolist()}")
+    depth = "depth0: {range_m: [0, 8]}\n"
+    (path / "calibration.yaml").write_text(f"{first}{second}{depth}imu0:{noise}")
+    return path
+
+
+@pytest.mark.parametrize("told", ["rate", "times"])
+def test_a_missing_file_shifts_no_other_one(tmp_path: Path, told: str) -> None:
+    """Whatever the times are from, images of one name belong together."""
+    path = write_three_folders(tmp_path)
+    for gone in ("right/4.png", "depth/2.png", "left/7.png"):
+        (path / gone).unlink()
+    if told == "times":
+        write_times(path / "timestamps.csv", count=9)
+    sequence = open_dataset(path, sources={"rate": "20"} if told == "rate" else None)
+    found = []
+    for frame in frames_of(sequence):
+        left, right = frame.images
+        assert left is not None
+        values = [left, right, None if frame.depth is None else frame.depth * 10]
+        found.append([None if image is None else round(float(image[0, 0])) for image in values])
+    expected = [[k, None if k == 5 else k, None if k == 3 else k] for k in range(1, 11) if k != 8]
+    assert found == expected
+    assert sequence.diagnostics.counts == {"camera_frame_missing": 3}
+
+
+def test_images_of_other_names_are_as_many_or_refused(tmp_path: Path) -> None:
+    path = write_three_folders(tmp_path)
+    for k in range(10):
+        (path / "right" / f"{k}.png").rename(path / "right" / f"r{k}.png")
+    frames = frames_of(open_dataset(path, sources={"rate": "20"}))
+    pairs = [[image[0, 0] for image in frame.images if image is not None] for frame in frames]
+    assert pairs == [[k, k] for k in range(1, 11)]
+    (path / "right" / "r3.png").unlink()
+    refused(path, "right: 9 images, none with the name of one of the 10 in", rate=20)
+
+
 def test_a_camera_of_an_euroc_folder_is_an_image_folder(tmp_path: Path) -> None:
     path = tmp_path / "cam0"
     (path / "data").mkdir(parents=True)

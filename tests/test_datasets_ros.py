@@ -6,6 +6,7 @@ import sqlite3
 from pathlib import Path
 
 import cv2
+import gtsam
 import numpy as np
 import pytest
 from recordings import FRAME_PERIOD_NS, START_NS, edit_text
@@ -65,6 +66,26 @@ def test_calibration_in_the_bag(tmp_path: Path) -> None:
     np.testing.assert_allclose(left.body_T_camera.translation(), [0.1, 0, 0], atol=1e-12)
     # the right camera is 0.1 m along the x axis of the left one, which points along y of the body
     np.testing.assert_allclose(right.body_T_camera.translation(), [0.1, 0.1, 0], atol=1e-12)
+
+
+@pytest.mark.parametrize("kind", ["ros1", "sqlite"])
+def test_rectified_images_have_axes_of_their_own(tmp_path: Path, kind: str) -> None:
+    """A direction x along the axes of the camera is R x along those of rectified images."""
+    R = gtsam.Rot3.Ypr(0.02, 0.09, -0.03).matrix()
+
+    def extra(bag: BagWriter) -> None:
+        image = np.zeros((SIZE[1], SIZE[0]), np.uint8)
+        bag.write("/left/image_rect", bag.image(START_NS, image, "mono8", "cam0"), START_NS)
+        bag.write("/left/camera_info", bag.camera_info(START_NS, "cam0", R=R), START_NS)
+
+    path = write_bag(tmp_path, kind, extra=extra)
+    topics = ("/cam0/image_raw", "/left/image_rect")
+    raw, rectified = (open_dataset(path, sources={"cam0": t}).rig.cameras[0] for t in topics)
+    expected = R @ raw.body_T_camera.rotation().matrix().T
+    found = rectified.body_T_camera.rotation().matrix().T
+    np.testing.assert_allclose(found, expected, atol=1e-12)
+    moved = rectified.body_T_camera.translation() - raw.body_T_camera.translation()
+    np.testing.assert_allclose(moved, np.zeros(3), atol=1e-12)
 
 
 def test_calibration_that_the_bag_lacks_is_asked_for(tmp_path: Path) -> None:

@@ -46,6 +46,17 @@ def rays_of(camera: Camera) -> Floats:
     return np.column_stack([plane, np.ones(len(plane))]).reshape(camera.height, camera.width, 3)
 
 
+def test_what_is_no_depth_is_never_one() -> None:
+    """Neither 0, whatever the range, nor what 16 bits do not hold; all else is kept."""
+    sensor = DepthSensor(scale=10_000.0, min_m=0.0, max_m=20.0)
+    assert np.isnan(sensor.metres(np.zeros((1, 2), np.uint16))).all()
+    assert np.isnan(sensor.metres(np.array([[0.0, -1.0, np.nan, 21.0]], np.float32))).all()
+    depth = np.array([[1e-4, 5.0, 6.5535, 6.5537, 9.9, np.inf, np.nan, 1e-6]], np.float32)
+    again = sensor.metres(sensor.raw(depth))
+    np.testing.assert_allclose(again[0, :3], depth[0, :3], atol=1e-6)
+    assert np.isnan(again[0, 3:]).all()
+
+
 def plane_depth(camera: Camera, normal: Floats, distance: float) -> NDArray[np.float32]:
     """Depth image of the plane normal · x = distance in the frame of a camera."""
     return (distance / (rays_of(camera) @ normal)).astype(np.float32)

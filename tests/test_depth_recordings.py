@@ -174,7 +174,7 @@ def test_depth_calibration_that_makes_no_sense(tmp_path: Path, line: str, match:
     (tmp_path / "rig.yaml").write_text(f"{CHAIN}depth0:\n  {line}\n")
     with pytest.raises(DataError, match=match) as error:
         read_kalibr(tmp_path / "rig.yaml")
-    assert "rig.yaml:9" in str(error.value)
+    assert "rig.yaml:11" in str(error.value)
 
 
 def test_a_depth_sensor_that_is_far_coarser_than_its_camera_is_refused() -> None:

@@ -5,13 +5,15 @@
 from __future__ import annotations
 
 from itertools import product
+from pathlib import Path
 
 import numpy as np
 import pytest
+from recordings import FRAME_PERIOD_NS, START_NS, write_euroc
 from typer.testing import CliRunner
 
 from slam_graph.cli.main import app
-from slam_graph.datasets import RecordedSequence, dataset_from_arrays
+from slam_graph.datasets import RecordedSequence, dataset_from_arrays, open_dataset
 from slam_graph.datasets.faults.fault import FAULTS, Fault
 from slam_graph.datasets.faults.injection import inject
 from slam_graph.errors import ConfigError, DataError
@@ -208,3 +210,36 @@ def test_a_run_on_a_faulty_recording(tmp_path: object) -> None:
     assert found.exit_code == 0, found.output
     wrong = CliRunner().invoke(app, f"run demo --inject nothing --output {tmp_path}")
     assert isinstance(wrong.exception, ConfigError)
+
+
+@pytest.mark.parametrize(
+    ("fault", "shift_s", "lost"),
+    [
+        ("frames_dropped:at_s=0.1,duration_s=0.1", 0.0, 2),
+        ("clock_jump:at_s=0.1,by_s=2.0", 2.0, 0),
+        ("kidnapped:at_s=0.1,duration_s=0.1", -0.1, 2),
+        ("image_other_place:at_s=0.1,duration_s=0.1", 0.0, 0),
+    ],
+)
+def test_masks_and_true_objects_stay_with_their_frames(
+    tmp_path: Path, fault: str, shift_s: float, lost: int
+) -> None:
+    """Also where a fault gives frames other stamps; masks that a fault belies are named."""
+    path = write_euroc(tmp_path / "flight", cameras=1)
+    stamps = [START_NS + k * FRAME_PERIOD_NS for k in range(8)]
+    (path / "masks").mkdir()
+    rows = "".join(f"{stamp},{k + 1},0,0,60,40\n" for k, stamp in enumerate(stamps))
+    (path / "masks" / "boxes.csv").write_text(rows)
+    truth = "".join(f"{stamp},1,{k},0,0,0,0,0,1\n" for k, stamp in enumerate(stamps))
+    (path / "objects_truth.csv").write_text(truth)
+    faulty = open_dataset(path, faults=[fault])
+    assert faulty.labels_over_time() is not None
+    warned = int(fault.startswith("image_other"))
+    assert faulty.diagnostics.counts["masks_without_fault"] == warned
+    frames = [frame.stamp_ns for frame in faulty.frames()]
+    numbers = [k + 1 for k in range(8) if not 2 <= k < 2 + lost]
+    assert [int(image[5, 5]) for s in frames if (image := faulty.label_image(s)) is not None] == (
+        numbers
+    )
+    assert frames[-1] == stamps[-1] + round(shift_s * 1e9)
+    assert faulty.object_truth()[1].stamps_ns[-1] == frames[-1]

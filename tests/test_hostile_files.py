@@ -368,3 +368,29 @@ def test_what_files_say_does_not_steer_a_terminal() -> None:
     """An error is one line of printable characters, whatever name or value it quotes."""
     said = str(DataError("topic '/a\0\x1b[2Jb' of \udc80\nanother line, in µm"))
     assert said == r"topic '/a\x00\x1b[2Jb' of \udc80 another line, in µm"
+
+
+@pytest.mark.parametrize(
+    ("header", "local"),
+    [
+        ("#timestamp [ns],latitude [deg],longitude [deg],altitude [m],e,n,u", False),
+        ("timestamp,latitude,longitude,altitude,sigma_east,sigma_north,sigma_up", False),
+        ("#timestamp [ns], east [m], north [m], up [m], e, n, u", True),
+        ("#timestamp,lat,lon,alt,sx,sy,sz", None),
+        ("# my receiver", None),
+        ("#timestamp [ns],latitude [rad],longitude [rad],altitude [m],e,n,u", None),
+        ("#timestamp [ns],north [m],east [m],up [m],e,n,u", None),
+        ("", None),
+    ],
+)
+def test_fixes_say_whether_they_are_degrees_or_metres(
+    tmp_path: Path, header: str, local: bool | None
+) -> None:
+    path = tmp_path / "gnss.csv"
+    path.write_text(f"{header}\n1000,48.1,11.5,520,1,1,2\n")
+    if local is None:
+        with pytest.raises(DataError, match=r"gnss\.csv: nothing says .* begin it with"):
+            read_fixes(path, Diagnostics())
+        return
+    found = read_fixes(path, Diagnostics()).fix_positions[0]
+    np.testing.assert_allclose(found, [48.1, 11.5, 520.0] if local else np.zeros(3), atol=1e-9)

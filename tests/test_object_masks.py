@@ -59,6 +59,13 @@ def test_masks_are_read_as_images_and_as_boxes(tmp_path: Path) -> None:
     assert len(masks) == 2
 
 
+def test_boxes_belong_to_every_stamp_to_the_last_digit(tmp_path: Path) -> None:
+    """Floats of today's stamps are multiples of 256 ns."""
+    stamps = [1_700_000_000_000_000_123 + 50_000_001 * k for k in range(8)]
+    masks = folder_of(tmp_path / "masks", "".join(f"{stamp},7,1,1,9,9\n" for stamp in stamps))
+    assert [labels_at(masks, stamp, (5.0, 5.0)) for stamp in stamps] == [[7]] * 8
+
+
 def test_what_is_near_a_thin_mask_has_no_label(tmp_path: Path) -> None:
     thin = np.zeros((40, 60), np.uint8)
     thin[20, 30] = 1

@@ -14,8 +14,10 @@ import pytest
 from flight import FISHEYE, FORWARD
 from numpy.typing import NDArray
 from pydantic import BaseModel
+from recordings_public import as_tum_vi
 from simulated_tracks import SHAPES, tracks
 
+from slam_graph.datasets.formats.euroc_writer import EurocWriter
 from slam_graph.errors import ConfigError, DataError
 from slam_graph.sensors.measurements import FeatureFrame
 from slam_graph.sensors.rig import Rig, RigCamera
@@ -290,3 +292,18 @@ def test_flights_of_one_world_seed_go_through_one_place(trajectory: str) -> None
     itself, same = flight(3, 3), flight(3, None)
     if trajectory == "rooms":
         np.testing.assert_array_equal(itself.landmarks.points, same.landmarks.points)
+
+
+@pytest.mark.parametrize("real_imu", [False, True])
+def test_one_flies_along_a_folder_of_tum_vi(tmp_path: Path, real_imu: bool) -> None:
+    """As it is downloaded: its calibration is beside ``mav0``."""
+    flown = tracks(duration_s=6.0)
+    path = tmp_path / "dataset-room9_512_16"
+    with EurocWriter(path, flown.rig, flown.groundtruth(), "", 20.0) as writer:
+        writer.write_imu(flown.imu())
+    for folder in (path / "mav0").glob("cam*"):
+        (folder / "data.csv").unlink()
+        (folder / "data").rmdir()
+    along = simulate(trajectory=str(as_tum_vi(path)), real_imu=real_imu, duration_s=3.0)
+    assert along.info().frames > 50
+    assert along.rig.cameras[0].camera == flown.rig.cameras[0].camera

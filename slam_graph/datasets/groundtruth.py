@@ -21,6 +21,7 @@ from slam_graph.datasets.streams.csv_rows import (
     read_rows,
     stamps_from_seconds,
 )
+from slam_graph.datasets.streams.pairing import in_order
 from slam_graph.datasets.streams.vector_lengths import lengths_of
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import DataError
@@ -106,15 +107,19 @@ def usable_states(
         DataError: if the file cannot be read, or holds none.
     """
     blocks = []
-    latest_ns = np.iinfo(np.int64).min
     for rows in read_rows(path):
         stamps, values = parse(rows)
-        kept = _usable(rows, stamps, values, latest_ns, diagnostics)
-        blocks.append((stamps[kept], values[kept]))
-        latest_ns = int(stamps[kept[-1]]) if len(kept) else latest_ns
-    if not sum(len(stamps) for stamps, _ in blocks):
+        whole = _whole(rows, values, diagnostics)
+        blocks.append((stamps[whole], values[whole], np.array(rows.numbers)[whole]))
+    if not sum(len(stamps) for stamps, _, _ in blocks):
         raise DataError(f"{path}: no usable state in this file")
-    return np.concatenate([b[0] for b in blocks]), np.concatenate([b[1] for b in blocks])
+    stamps, values, lines = (np.concatenate(parts) for parts in zip(*blocks, strict=True))
+
+    def dropped(k: int, _: int) -> None:
+        diagnostics.warn("groundtruth_out_of_order", f"{path}:{lines[k]}: row dropped")
+
+    kept = in_order(stamps, dropped)
+    return stamps[kept], values[kept]
 
 
 def _layout(rows: Rows) -> tuple[str | None, int]:
@@ -152,27 +157,14 @@ def _parse_block(rows: Rows) -> tuple[IntArray, FloatArray]:
     return table["stamp"], values
 
 
-def _usable(
-    rows: Rows,
-    stamps: IntArray,
-    values: FloatArray,
-    latest_ns: int,
-    diagnostics: Diagnostics,
-) -> NDArray[np.intp]:
-    """Indices of the rows that are finite, have a rotation, and are later than those before."""
+def _whole(rows: Rows, values: FloatArray, diagnostics: Diagnostics) -> NDArray[np.intp]:
+    """Indices of the rows that are finite and have a rotation; the others are counted."""
     whole = Files.are_measurable(values).all(axis=1)
     lengths = lengths_of(values[:, 3:7])
     whole &= (lengths > _SMALLEST_QUATERNION) & np.isfinite(lengths)
     for k in np.flatnonzero(~whole):
         diagnostics.warn("groundtruth_not_finite", f"{rows.where(int(k))}: row dropped")
-    kept = []
-    for k in np.flatnonzero(whole):
-        if stamps[k] <= latest_ns:
-            diagnostics.warn("groundtruth_out_of_order", f"{rows.where(int(k))}: row dropped")
-            continue
-        latest_ns = int(stamps[k])
-        kept.append(k)
-    return np.array(kept, np.intp)
+    return np.flatnonzero(whole)
 
 
 def _trajectory(stamps: IntArray, values: FloatArray) -> Trajectory:

@@ -25,7 +25,8 @@ from slam_graph.datasets.groundtruth import (
 )
 from slam_graph.datasets.object_sources import ObjectSources
 from slam_graph.datasets.packets import packetize, packetize_alone
-from slam_graph.datasets.streams.aiding_files import read_aiding, with_aiding
+from slam_graph.datasets.streams.aiding_files import read_aiding
+from slam_graph.datasets.streams.aiding_packets import with_aiding
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.display import Displayed
 from slam_graph.geometry import NavState, Trajectory

@@ -77,10 +77,16 @@ class DepthSensor:
         if raw.dtype == np.uint16:
             depth /= np.float32(self.scale)
         with np.errstate(invalid="ignore"):
-            depth[~((depth >= self.min_m) & (depth <= self.max_m))] = np.nan
+            measured = (depth > 0.0) & (depth >= self.min_m) & (depth <= self.max_m)
+        depth[~measured] = np.nan
         return depth
 
     def raw(self, depth: NDArray[np.float32]) -> NDArray[np.uint16]:
-        """The image (height, width) of 16 bits of a depth, with 0 for NaN; `metres` undoes it."""
-        units = np.nan_to_num(np.rint(depth * np.float32(self.scale)), nan=0.0)
-        return np.asarray(np.clip(units, 0, np.iinfo(np.uint16).max), np.uint16)
+        """The image (height, width) of 16 bits of a depth; `metres` undoes it.
+
+        It has 0 for NaN, and for what 16 bits of these units do not hold.
+        """
+        with np.errstate(over="ignore", invalid="ignore"):
+            units = np.rint(depth * np.float32(self.scale))
+            fits = (units > 0.0) & (units <= np.iinfo(np.uint16).max)
+        return np.where(fits, units, 0.0).astype(np.uint16)

@@ -71,7 +71,7 @@ class RecordedFlight:
         folder = path / "mav0" if (path / "mav0").is_dir() else path
         sequence = None
         if (folder / "imu0" / "data.csv").is_file() and any(folder.glob("cam[0-9]*")):
-            sequence = open_dataset(path, "euroc", diagnostics=diagnostics)
+            sequence = open_dataset(path, diagnostics=diagnostics)
         elif config.real_imu:
             raise DataError(f"{path}: no recorded IMU here; an EuRoC folder has one in mav0/imu0")
         if sequence is None:

@@ -10,7 +10,9 @@ from pathlib import Path
 from typing import Any
 
 import gtsam
+import numpy as np
 
+from slam_graph.arrays import FloatArray
 from slam_graph.datasets.calibration.calibration_yaml import YamlValue, read_yaml
 from slam_graph.errors import DataError
 from slam_graph.sensors import CAMERA_MODELS, Camera, CameraModel, ImuNoise, Rig, RigCamera
@@ -22,6 +24,14 @@ _LARGEST_SIZE = 65535
 """Width and height of images, pixels."""
 _LARGEST_NUMBER, _SHORTEST_FOCAL_PX = 1e6, 1e-3
 """Bounds on focal lengths, principal points and coefficients of lenses; lenses keep far off."""
+
+_SAME_AXES = 1e-9
+"""Largest difference of the scales, axes and mounting of an IMU from those that change nothing."""
+_NEUTRAL = {
+    "accelerometers": {"M": np.eye(3)},
+    "gyroscopes": {"M": np.eye(3), "A": np.zeros((3, 3)), "C_gyro_i": np.eye(3)},
+}
+"""Kalibr's matrices of an IMU by which no sample changes."""
 
 _SAME_READOUT = 0.01
 """Largest relative difference of `readout_time` from `line_delay` times the height."""
@@ -216,14 +226,48 @@ def read_imu_noise(entry: YamlValue) -> ImuNoise:
     """IMU noise from a mapping with the keys that EuRoC and Kalibr share.
 
     Raises:
-        DataError: naming file and line of what is missing or not above 0.
+        DataError: naming file and line of what is missing or not above 0, or of a model of the IMU
+            by which its samples would have to be corrected (Kalibr's `scale-misalignment`).
     """
+    _refuse_uncorrected(entry)
     return ImuNoise(
         gyro_noise_density=entry.require("gyroscope_noise_density").positive(),
         gyro_random_walk=entry.require("gyroscope_random_walk").positive(),
         accel_noise_density=entry.require("accelerometer_noise_density").positive(),
         accel_random_walk=entry.require("accelerometer_random_walk").positive(),
         rate_hz=entry.require("rate_hz", "update_rate").positive(),
+    )
+
+
+def _refuse_uncorrected(entry: YamlValue) -> None:
+    """Refuse an IMU whose samples are not those of its calibrated axes, in the body frame.
+
+    Kalibr estimates its scales, the misalignment of its axes, and of a further IMU its mounting and
+    clock; no sample is corrected by them.
+    """
+    hint = "samples are not corrected by it; correct them before, or calibrate with 'calibrated'"
+    model = entry.get("model")
+    if model is not None and model.text() != "calibrated":
+        raise DataError(f"{model.where}: IMU model '{model.text()[:40]}': {hint}")
+    offset = entry.get("time_offset")
+    if offset is not None and offset.number() != 0.0:
+        raise DataError(f"{offset.where}: {offset.number():g} s: {hint}")
+    mounting = entry.get("T_i_b")
+    if mounting is not None and not mounting.pose().equals(gtsam.Pose3(), _SAME_AXES):
+        raise DataError(f"{mounting.where}: not the identity: {hint}")
+    for sensor, neutral in _NEUTRAL.items():
+        group = entry.get(sensor)
+        for key, expected in neutral.items():
+            value = None if group is None else group.get(key)
+            if value is not None and not _are_near(value, expected):
+                raise DataError(f"{value.where} of {sensor}: not that of perfect axes: {hint}")
+
+
+def _are_near(value: YamlValue, expected: FloatArray) -> bool:
+    """Whether the rows of a matrix are those expected."""
+    numbers = [number for row in value.elements() for number in row.numbers()]
+    return len(numbers) == expected.size and bool(
+        np.allclose(numbers, expected.ravel(), rtol=0.0, atol=_SAME_AXES)
     )
 
 
@@ -257,12 +301,14 @@ def read_euroc_rig(mav0: str | Path, cameras: Iterable[str], imu: str = "imu0") 
     for name in cameras:
         entry = read_yaml(mav0 / name / "sensor.yaml")
         platform_T_camera = entry.require("T_BS").pose()
-        shift = entry.get("timeshift_cam_imu")  # not EuRoC's; our writer adds it
+        shift = entry.get("timeshift_cam_imu")  # not EuRoC's; our writer adds it, and this one
+        known = entry.get("rotation_known")
         camera = RigCamera(
             read_camera(entry),
             platform_T_imu.between(platform_T_camera),
             0.0 if shift is None else shift.seconds(),
             name,
+            rotation_known=known is None or known.text().lower() != "false",
         )
         mounted.append(with_shutter(camera, entry))
     return Rig(tuple(mounted), noise)

@@ -4,9 +4,10 @@
 
 Kalibr writes `T_cam_imu`, the pose of the IMU in the camera frame, which is the inverse of our
 `body_T_camera`; `T_cn_cnm1` is the pose of the previous camera in the frame of this one. The first
-camera may say `T_cam_imu: unknown`; its mounting is then estimated. The IMU's
-noise stands in a file of its own (flat, or under the key ``imu0``); `write_kalibr` puts it into the
-same file under ``imu0``, so that one file describes the rig.
+camera may say `T_cam_imu: unknown`; its mounting is then estimated, and the other cameras are
+mounted on it by their `T_cn_cnm1`, as nothing connects it with their `T_cam_imu`. The IMU's noise
+stands in a file of its own (flat, or under the key ``imu0``); `write_kalibr` puts it into the same
+file under ``imu0``, so that one file describes the rig.
 
 Kalibr does not know of depth. A key ``depth0`` beside the cameras describes what measures it
 (`depth_calibration`).
@@ -16,7 +17,7 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeGuard
 
 import gtsam
 import yaml
@@ -30,6 +31,7 @@ from slam_graph.datasets.calibration.euroc_calibration import (
     shutter_entry,
     with_shutter,
 )
+from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import DataError
 from slam_graph.files import Files
 from slam_graph.sensors import DepthSensor, ImuNoise, Rig, RigCamera
@@ -47,6 +49,7 @@ def read_kalibr(
     imu_path: str | Path | None = None,
     fallback: ImuNoise | None = None,
     needs_imu: bool = True,
+    diagnostics: Diagnostics | None = None,
 ) -> Rig:
     """Read a rig from a Kalibr camera chain.
 
@@ -57,6 +60,8 @@ def read_kalibr(
         fallback: noise to take if no file has any; default that of EuRoC's IMU.
         needs_imu: whether the cameras must be calibrated to the IMU; otherwise a chain that does
             not say where it is has the body frame of its first camera.
+        diagnostics: counts `imu_noise_assumed` if the IMU is needed, and neither a file nor
+            `fallback` has its noise.
 
     Raises:
         DataError: if a file or key is missing, or a value makes no sense; names file and line.
@@ -64,8 +69,18 @@ def read_kalibr(
     chain = read_yaml(path)
     no_imu = _says_none(chain)
     cameras = _chain_cameras(chain, needs_imu and not no_imu)
-    noise = ImuNoise() if no_imu else _read_imu(chain, imu_path, fallback)
+    noise = ImuNoise() if no_imu else _read_imu(chain, imu_path) or fallback
+    if noise is None:
+        noise = ImuNoise()
+        if needs_imu and diagnostics is not None:
+            warn_noise_assumed(path, diagnostics)
     return Rig(cameras, noise, not no_imu, _read_depth(chain, len(cameras)))
+
+
+def warn_noise_assumed(path: str | Path, diagnostics: Diagnostics) -> None:
+    """Count that the noise of an IMU is that of EuRoC's, as nothing at `path` has any."""
+    what = "no noise densities of the IMU are given; those of EuRoC's are assumed"
+    diagnostics.warn("imu_noise_assumed", f"{path}: {what}")
 
 
 def rig_from_kalibr(text: str, path: str | Path) -> Rig:
@@ -101,25 +116,28 @@ def _chain_cameras(chain: YamlValue, needs_imu: bool = True) -> tuple[RigCamera,
         raise DataError(
             f"{chain.path}: no camera (key 'cam0') in this file; is it a Kalibr camera chain?"
         )
-    cameras: list[RigCamera] = []
+    cameras: dict[int, RigCamera] = {}
+    in_body = _is_given(entries[min(entries)].get("T_cam_imu"))
     for index in sorted(entries):
-        cameras.append(_read_camera(entries[index], cameras[-1] if cameras else None, needs_imu))
-    return tuple(cameras)
+        entry = entries[index]
+        if not cameras:
+            pose, known = _first_pose(entry, needs_imu), not _is_unknown(entry)
+        elif in_body and _is_given(direct := entry.get("T_cam_imu")):
+            pose, known = direct.pose().inverse(), True
+        else:
+            pose, known = _linked_pose(entry, cameras.get(index - 1), in_body)
+        cameras[index] = _read_camera(entry, pose, known)
+    return tuple(cameras.values())
 
 
-def _read_camera(entry: YamlValue, previous: RigCamera | None, needs_imu: bool) -> RigCamera:
-    body_T_camera = _body_T_camera(entry, previous, needs_imu)
-    shift = entry.get("timeshift_cam_imu")
-    known = not _is_unknown(entry)
-    if entry.get("T_cam_imu") is None and previous is not None:
-        known = previous.rotation_known
-    name = entry.get("name")
+def _read_camera(entry: YamlValue, body_T_camera: gtsam.Pose3, rotation_known: bool) -> RigCamera:
+    shift, name = entry.get("timeshift_cam_imu"), entry.get("name")
     mounted = RigCamera(
         read_camera(entry),
         body_T_camera,
         0.0 if shift is None else shift.seconds(),
         entry.key if name is None else name.text(),
-        rotation_known=known,
+        rotation_known=rotation_known,
     )
     return with_shutter(mounted, entry)
 
@@ -127,11 +145,14 @@ def _read_camera(entry: YamlValue, previous: RigCamera | None, needs_imu: bool) 
 def _is_unknown(entry: YamlValue) -> bool:
     """Whether a camera says that its mounting is not known."""
     direct = entry.get("T_cam_imu")
-    return (
-        direct is not None
-        and isinstance(direct.node, yaml.ScalarNode)
-        and direct.text() == _UNKNOWN
-    )
+    return direct is not None and not _is_given(direct)
+
+
+def _is_given(direct: YamlValue | None) -> TypeGuard[YamlValue]:
+    """Whether a `T_cam_imu` is there, and is not said to be unknown."""
+    if direct is None:
+        return False
+    return not isinstance(direct.node, yaml.ScalarNode) or direct.text() != _UNKNOWN
 
 
 def _says_none(chain: YamlValue) -> bool:
@@ -140,20 +161,43 @@ def _says_none(chain: YamlValue) -> bool:
     return imu is not None and isinstance(imu.node, yaml.ScalarNode) and imu.text() == _NONE
 
 
-def _body_T_camera(entry: YamlValue, previous: RigCamera | None, needs_imu: bool) -> gtsam.Pose3:
-    direct, link = entry.get("T_cam_imu"), entry.get("T_cn_cnm1")
-    if _is_unknown(entry) and previous is None:
-        return gtsam.Pose3()
-    if direct is not None:
+def _first_pose(entry: YamlValue, needs_imu: bool) -> gtsam.Pose3:
+    """body_T_camera of the first camera; its own frame is the body frame if it is not known."""
+    direct = entry.get("T_cam_imu")
+    if _is_given(direct):
         return direct.pose().inverse()
-    if link is not None and previous is not None:
-        return previous.body_T_camera.compose(link.pose().inverse())
-    if previous is None and not needs_imu:
-        return gtsam.Pose3()
-    raise DataError(
-        f"{entry.where}: missing key 'T_cam_imu'; use the camchain-imucam file of Kalibr, "
-        f"from calibrating cameras and IMU together, or 'T_cam_imu: {_UNKNOWN}' to estimate it"
-    )
+    if direct is None and needs_imu:
+        raise DataError(
+            f"{entry.where}: missing key 'T_cam_imu'; use the camchain-imucam file of Kalibr, "
+            f"from calibrating cameras and IMU together, or 'T_cam_imu: {_UNKNOWN}' to estimate it"
+        )
+    return gtsam.Pose3()
+
+
+def _linked_pose(
+    entry: YamlValue, previous: RigCamera | None, in_body: bool
+) -> tuple[gtsam.Pose3, bool]:
+    """body_T_camera of a camera that is mounted on the previous one, and whether it is known.
+
+    Args:
+        entry: of the camera.
+        previous: the camera whose number is one less; None if there is none.
+        in_body: whether the first camera says where the IMU is.
+    """
+    link = entry.get("T_cn_cnm1")
+    if link is None:
+        first = "" if in_body else ", as the first camera does not say where the IMU is"
+        either = "'T_cam_imu' or " if in_body else ""
+        raise DataError(
+            f"{entry.where}: missing key {either}'T_cn_cnm1', the pose of the previous camera in "
+            f"the frame of this one{first}; it is in the camchain files of Kalibr"
+        )
+    if previous is None:
+        raise DataError(
+            f"{link.where}: is from the camera before, and there is no camera of that number in "
+            "this file; add it, number the cameras cam0, cam1, … without gaps, or give T_cam_imu"
+        )
+    return previous.body_T_camera.compose(link.pose().inverse()), previous.rotation_known
 
 
 def _read_depth(chain: YamlValue, cameras: int) -> DepthSensor | None:
@@ -161,7 +205,8 @@ def _read_depth(chain: YamlValue, cameras: int) -> DepthSensor | None:
     return None if entry is None else read_depth_sensor(entry, cameras)
 
 
-def _read_imu(chain: YamlValue, imu_path: str | Path | None, fallback: ImuNoise | None) -> ImuNoise:
+def _read_imu(chain: YamlValue, imu_path: str | Path | None) -> ImuNoise | None:
+    """The noise of the IMU; None if no file has it."""
     beside = chain.path.parent / "imu.yaml"
     entry = chain.get(_IMU_KEY) if imu_path is None else None
     if entry is None and imu_path is None and beside.is_file():
@@ -169,9 +214,7 @@ def _read_imu(chain: YamlValue, imu_path: str | Path | None, fallback: ImuNoise 
     if imu_path is not None:
         whole = read_yaml(imu_path)
         entry = whole.get(_IMU_KEY) or whole
-    if entry is not None:
-        return read_imu_noise(entry)
-    return fallback if fallback is not None else ImuNoise()
+    return None if entry is None else read_imu_noise(entry)
 
 
 def write_kalibr(rig: Rig, path: str | Path) -> None:
@@ -210,7 +253,7 @@ def _imu_entry(noise: ImuNoise) -> dict[str, float]:
 def _mounting(rig: Rig, index: int) -> dict[str, Any]:
     """Where a camera is: on the body, or beside the one before if the body does not know."""
     mounted = rig.cameras[index]
-    if mounted.rotation_known:
+    if mounted.rotation_known and (index == 0 or rig.cameras[0].rotation_known):
         return {"T_cam_imu": mounted.body_T_camera.inverse().matrix().tolist()}
     if index == 0:
         return {"T_cam_imu": _UNKNOWN}

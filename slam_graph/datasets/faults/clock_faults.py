@@ -69,6 +69,12 @@ class ClockJump(_Rewritten):
         late = stamps_ns >= self.begin_ns(around)
         return stamps_ns + late * round(self.by_s * 1e9)
 
+    def recorded(self, stamps_ns: IntArray, around: Surroundings) -> IntArray:
+        """Stamps by the clock that does not jump."""
+        by_ns = round(self.by_s * 1e9)
+        late = stamps_ns >= self.begin_ns(around) + max(by_ns, 0)
+        return stamps_ns - late * by_ns
+
 
 @FAULTS.register("all_missing")
 class AllMissing(_Rewritten):
@@ -94,6 +100,11 @@ class Kidnapped(AllMissing):
         """Stamps, without the time that is cut out."""
         late = stamps_ns >= self.end_ns(around)
         return stamps_ns - late * round(self.duration_s * 1e9)
+
+    def recorded(self, stamps_ns: IntArray, around: Surroundings) -> IntArray:
+        """Stamps with the time that is cut out."""
+        late = stamps_ns >= self.begin_ns(around)
+        return stamps_ns + late * round(self.duration_s * 1e9)
 
     def truth(self, truth: Trajectory, around: Surroundings) -> Trajectory:
         """The truth without what is cut out."""

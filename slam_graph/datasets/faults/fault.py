@@ -6,7 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 from pydantic import Field
@@ -38,7 +38,13 @@ class Surroundings:
 
 
 class Fault(Settings):
-    """A fault: what it does to frames, IMU samples and ground truth; here, nothing."""
+    """A fault: what it does to frames, IMU samples and ground truth; here, nothing.
+
+    Attributes:
+        fits_masks: whether masks of the recording are still those of what images show.
+    """
+
+    fits_masks: ClassVar[bool] = True
 
     at_s: float = Field(6.0, ge=0.0, le=1e6)
     """When it begins, in seconds after the first frame."""
@@ -70,6 +76,10 @@ class Fault(Settings):
 
     def stamped(self, stamps_ns: IntArray, around: Surroundings) -> IntArray:
         """The stamps (N,) that what is recorded at these times gets."""
+        return stamps_ns
+
+    def recorded(self, stamps_ns: IntArray, around: Surroundings) -> IntArray:
+        """The stamps (N,) of what is recorded, of the stamps that it has got; undoes `stamped`."""
         return stamps_ns
 
     def begin_ns(self, around: Surroundings) -> int:

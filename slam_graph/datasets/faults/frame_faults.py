@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import cv2
 import numpy as np
@@ -223,6 +223,8 @@ class ImageNoise(CameraFault):
 class ImageOtherPlace(CameraFault):
     """Images show another place: the same ones upside down."""
 
+    fits_masks: ClassVar[bool] = False
+
     def image(
         self, image: Image, camera: RigCamera, around: Surroundings, rng: np.random.Generator
     ) -> Image:
@@ -240,6 +242,8 @@ class ImageOtherPlace(CameraFault):
 @FAULTS.register("image_frozen")
 class ImageFrozen(FrameFault):
     """The first image comes again and again."""
+
+    fits_masks: ClassVar[bool] = False
 
     duration_s: float = Field(2.0, gt=0.0)
     """How long it lasts."""

@@ -14,6 +14,7 @@ import numpy as np
 
 from slam_graph.datasets.faults import clock_faults, frame_faults, imu_faults  # noqa: F401
 from slam_graph.datasets.faults.fault import FAULTS, Fault, Surroundings
+from slam_graph.datasets.object_sources import LabelsOverTime
 from slam_graph.datasets.sequence import (
     FrameStream,
     ReaderOptions,
@@ -21,6 +22,7 @@ from slam_graph.datasets.sequence import (
     SequenceInfo,
 )
 from slam_graph.datasets.streams.imu_stream import clean_blocks
+from slam_graph.datasets.streams.mask_images import LabelImage
 from slam_graph.errors import ConfigError, DataError
 from slam_graph.geometry import NavState, Trajectory
 from slam_graph.sensors import AidingData, ImuData
@@ -141,6 +143,39 @@ class FaultySequence(RecordedSequence):
         for fault in self.faults:
             truth = None if truth is None else fault.truth(truth, self._around)
         return truth
+
+    def object_truth(self) -> dict[int, Trajectory]:
+        """True poses of moving objects at the times that the recording says."""
+        truth = self.recording.object_truth()
+        for fault in self.faults:
+            truth = {number: fault.truth(path, self._around) for number, path in truth.items()}
+        return truth
+
+    @property
+    def masks(self) -> int:
+        """Number of masks of the recording."""
+        return self.recording.masks
+
+    @property
+    def mask_classes(self) -> dict[int, str]:
+        """Name of the class by label."""
+        return self.recording.mask_classes
+
+    def labels_over_time(self) -> LabelsOverTime | None:
+        """What gives tracks the labels of the masks; a fault does not change these."""
+        labels = super().labels_over_time()
+        changed = [type(fault).__name__ for fault in self.faults if not fault.fits_masks]
+        if labels is not None and changed:
+            what = f"{self.name}: masks are those of the images without {', '.join(changed)}"
+            self.diagnostics.warn("masks_without_fault", what)
+        return labels
+
+    def label_image(self, stamp_ns: int) -> LabelImage | None:
+        """The label image that the recording has for a frame, whatever stamp it has now."""
+        stamp = np.array([stamp_ns], np.int64)
+        for fault in reversed(self.faults):
+            stamp = fault.recorded(stamp, self._around)
+        return self.recording.label_image(int(stamp[0]))
 
     def initial_state(self) -> NavState | None:
         """The state that comes with the recording."""

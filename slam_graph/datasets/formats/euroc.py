@@ -84,7 +84,7 @@ def _read_rig(mav0: Path, options: ReaderOptions) -> tuple[Rig, list[Path]]:
         imu = next((file for file in beside if file.is_file()), None)
         noise = read_imu_noise(read_yaml(imu)) if imu is not None else None
         needs_imu = options.imu and (mav0 / "imu0").is_dir()
-        rig = read_kalibr(chain, fallback=noise, needs_imu=needs_imu)
+        rig = read_kalibr(chain, None, noise, needs_imu, options.diagnostics)
         if len(rig.cameras) > len(folders):
             raise DataError(
                 f"{chain}: calibrates {len(rig.cameras)} cameras, {mav0} has {len(folders)}; "

@@ -194,6 +194,11 @@ class EurocWriter:
         with Files.writing(self._path):
             (self._folder / MASKS / f"{stamp_ns}.png").write_bytes(data.tobytes())
 
+    def write_classes(self, files: Mapping[str, str]) -> None:
+        """Texts that belong to the label images, by the names of their files; none without any."""
+        if (self._folder / MASKS).is_dir():
+            self._notes |= {f"{MASKS}/{name}": text for name, text in files.items()}
+
     def _write_image(self, index: TextIO, folder: Path, image: NDArray[Any], stamp_ns: int) -> None:
         name = f"{stamp_ns}.png"
         good, data = cv2.imencode(".png", image)
@@ -213,7 +218,8 @@ class EurocWriter:
         """Write a recording to a new EuRoC folder, completely or not at all.
 
         Images become 8 bit grey PNG with the stamp of their frame. Unusable samples of the IMU are
-        left out, and so are missing and damaged images; the sequence counts them.
+        left out, and so are missing and damaged images; the sequence counts them. Masks become
+        label images with the stamp of their frame.
 
         Args:
             sequence: any recording of images; without an IMU there is no ``imu0`` in the folder.
@@ -234,7 +240,9 @@ class EurocWriter:
         rate_hz = round((info.frames - 1) / seconds, 3)
         comment = f"converted from {info.format}"
         rig, truth, has_imu = sequence.rig, sequence.groundtruth(), sequence.has_imu
-        with EurocWriter(Path(path), rig, truth, comment, rate_hz, force, has_imu) as writer:
+        notes = sequence.object_truth_file()
+        new = EurocWriter(Path(path), rig, truth, comment, rate_hz, force, has_imu, notes)
+        with new as writer:
             writer.write_aiding(sequence.aiding)
             for block in sequence.imu_blocks():
                 writer.write_imu(block)
@@ -242,8 +250,12 @@ class EurocWriter:
                 if not isinstance(frame, CameraFrame):
                     raise DataError(f"{info.name}: frame at {frame.stamp_ns} holds no images")
                 writer.write_frame(frame)
+                labels = sequence.label_image(frame.stamp_ns)
+                if labels is not None:
+                    writer.write_mask(frame.stamp_ns, labels)
                 if progress is not None:
                     progress(frame.stamp_ns)
+            writer.write_classes(sequence.classes_file())
 
     def _open(self, folder: Path, columns: str, calibration: dict[str, object]) -> TextIO:
         """The index of a new sensor, beside its calibration."""
@@ -293,7 +305,7 @@ def _truth_rows(truth: Trajectory) -> FloatArray:
 
 
 def _camera_values(mounted: RigCamera, rate_hz: float) -> dict[str, object]:
-    """What EuRoC's ``sensor.yaml`` holds, and keys for time offset and rolling shutter, if any."""
+    """What EuRoC's ``sensor.yaml`` holds, and keys for what else is known of the camera, or not."""
     camera, entry = mounted.camera, camera_entry(mounted.camera)
     values: dict[str, object] = {
         "T_BS": _matrix(mounted.body_T_camera),
@@ -304,6 +316,8 @@ def _camera_values(mounted: RigCamera, rate_hz: float) -> dict[str, object]:
         "distortion_model": entry.euroc_distortion,
         "distortion_coefficients": entry.coefficients,
     }
+    if not mounted.rotation_known:
+        values["rotation_known"] = False
     if mounted.time_offset_s:
         values["timeshift_cam_imu"] = float(mounted.time_offset_s)
     return values | shutter_entry(mounted)

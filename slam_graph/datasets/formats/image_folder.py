@@ -99,12 +99,12 @@ def find_files(
         stamps=None if rate_hz is not None else files["stamps"],
         rate_hz=rate_hz,
         imu=None if imu is None else ImuFile(imu, _parse_timed_imu),
-        rig=options.select(_calibrated(chain, imu is not None and options.imu, cameras)),
+        rig=options.select(_calibrated(chain, imu is not None and options.imu, cameras, options)),
     )
 
 
-def _calibrated(chain: Path, needs_imu: bool, cameras: int) -> Rig:
-    rig = read_kalibr(chain, needs_imu=needs_imu)
+def _calibrated(chain: Path, needs_imu: bool, cameras: int, options: ReaderOptions) -> Rig:
+    rig = read_kalibr(chain, needs_imu=needs_imu, diagnostics=options.diagnostics)
     if len(rig.cameras) < cameras:
         raise DataError(
             f"{chain}: calibrates {len(rig.cameras)} cameras, there are images of {cameras}"
@@ -258,8 +258,8 @@ class ImageFolderSequence(ImageSequence):
     Their times are in a table (see `loose_files`), whose second column may name the files. Without
     names the times belong to the images in the order of the numbers in their names. Without a table
     the names of the images must be their times, or a rate must be given. Images of the second
-    camera, and of depth, have the names of those of the first, without their endings, or are as
-    many.
+    camera, and of depth, have the times of those of the first with the same name, without its
+    ending, so that some may be missing; with other names they are as many, in the same order.
 
     Depth images are in ``depth``, and the calibration has a key ``depth0``.
 
@@ -309,18 +309,23 @@ def _depth(
 def _list_images(
     folder: Path, files: LooseFiles, diagnostics: Diagnostics, first: Path
 ) -> FileImages:
-    """The images in a folder; a table of times may name those in the `first` one."""
-    there = sorted(
-        (file for file in folder.iterdir() if file.suffix.lower() in SUFFIXES), key=_by_number
-    )
-    stamps, paths, index = _times(folder, there, files, first)
+    """The images in a folder, with their times or those of the images in the `first` one."""
+    if folder == first or (files.rate_hz is None and files.stamps is None):
+        stamps, paths, index = _times(folder, files)
+    else:
+        stamps, paths, index = _times_of_first(folder, files, diagnostics, first)
     return ordered_images(folder.name, stamps, paths, index, diagnostics)
 
 
-def _times(
-    folder: Path, there: list[Path], files: LooseFiles, first: Path
-) -> tuple[IntArray, list[Path], Path]:
+def _images_in(folder: Path) -> list[Path]:
+    """The images in a folder, in the order of the numbers in their names."""
+    images = (file for file in folder.iterdir() if file.suffix.lower() in SUFFIXES)
+    return sorted(images, key=_by_number)
+
+
+def _times(folder: Path, files: LooseFiles) -> tuple[IntArray, list[Path], Path]:
     """Times (N,), the image of each, and where the times are from."""
+    there = _images_in(folder)
     if files.rate_hz is not None:
         return regular_stamps(len(there), files.rate_hz), there, folder
     if files.stamps is None:
@@ -332,10 +337,6 @@ def _times(
             )
         return stamps, there, folder
     stamps, names = read_stamps(files.stamps)
-    if all(names) and folder != first:
-        named = {path.stem: path for path in there}
-        rows = [k for k, name in enumerate(names) if Path(name).stem in named]
-        return stamps[rows], [named[Path(names[k]).stem] for k in rows], files.stamps
     if all(names):
         return stamps, [_named(folder, files.stamps, name) for name in names], files.stamps
     if len(stamps) != len(there):
@@ -343,6 +344,28 @@ def _times(
             f"{files.stamps}: {len(stamps)} times without names, {len(there)} images in {folder}"
         )
     return stamps, there, files.stamps
+
+
+def _times_of_first(
+    folder: Path, files: LooseFiles, diagnostics: Diagnostics, first: Path
+) -> tuple[IntArray, list[Path], Path]:
+    """As `_times`, of images that have the names of those in the `first` folder, or are as many."""
+    stamps, images, index = _times(first, files)
+    there = _images_in(folder)
+    named = {path.stem: path for path in there}
+    rows = [k for k, image in enumerate(images) if image.stem in named]
+    if rows:
+        alone = len(named.keys() - {image.stem for image in [*images, *_images_in(first)]})
+        if alone:
+            what = f"{folder}: {alone} images left out, as {first} has none of their names"
+            diagnostics.warn("camera_frame_missing", what)
+        return stamps[rows], [named[images[k].stem] for k in rows], index
+    if len(there) != len(images):
+        raise DataError(
+            f"{folder}: {len(there)} images, none with the name of one of the {len(images)} in "
+            f"{first}; give them the names of those that they belong to"
+        )
+    return stamps, there, index
 
 
 def _named(folder: Path, table: Path, name: str) -> Path:

@@ -176,7 +176,12 @@ class OpenvinsSimulation(RecordedSequence):
         options = options or ReaderOptions()
         self.path = path
         chain = options.calibration
-        rig = _read_rig(path / "calib.yaml") if chain is None else read_kalibr(chain)
+        own_file = path / "calib.yaml"
+        if chain is None:
+            rig = _read_rig(own_file)
+        else:
+            noise = _read_rig(own_file).imu if own_file.is_file() else None
+            rig = read_kalibr(chain, fallback=noise, diagnostics=options.diagnostics)
         self._known_cameras = len(rig.cameras)
         truth = path / "groundtruth.csv"
         own = partial(_read_states, truth, options.diagnostics) if truth.is_file() else None

@@ -136,7 +136,9 @@ class TrackRecordingSequence(RecordedSequence):
         recorded = read_kalibr(path / CALIBRATION)
         chain = options.calibration
         self._recalibrated = chain is not None
-        rig = recorded if chain is None else read_kalibr(chain, needs_imu=recorded.has_imu)
+        rig = recorded
+        if chain is not None:
+            rig = read_kalibr(chain, fallback=recorded.imu, needs_imu=recorded.has_imu)
         rig = replace(options.select(rig), has_imu=recorded.has_imu)
         truth = path / GROUNDTRUTH
         own = partial(load_trajectory, truth) if truth.is_file() else None
@@ -153,6 +155,9 @@ class TrackRecordingSequence(RecordedSequence):
         depth_camera = meta.get("depth_camera")
         most = self._cameras - 1
         self._depth_camera = None if depth_camera is None else _whole(depth_camera, 0, most)
+        if self._depth_camera is not None and chain is not None and rig.depth is None:
+            what = f"{chain}: has no 'depth0', so the depth of {path} means nothing"
+            self.diagnostics.warn("depth_left_out", what)
         self._record = frame_record(self._cameras)
         self._check_sizes(counts)
         self._index = np.fromfile(path / FRAMES, self._record)

@@ -19,7 +19,13 @@ from numpy.typing import NDArray
 
 from slam_graph.datasets.rosbag.bag import Bag
 from slam_graph.datasets.rosbag.messages import COMPRESSED_IMAGE, IMAGE, PackedImage, RawImage
-from slam_graph.datasets.rosbag.ros_topics import Topics, frame_of, own_camera, path_between
+from slam_graph.datasets.rosbag.ros_topics import (
+    Topics,
+    camera_T_image,
+    frame_of,
+    own_camera,
+    path_between,
+)
 from slam_graph.datasets.streams.depth_images import decode_depth
 from slam_graph.datasets.streams.images import Fault
 from slam_graph.diagnostics import Diagnostics
@@ -89,7 +95,10 @@ def _sensor(bag: Bag, topic: str, topics: Topics, frames: list[str]) -> DepthSen
         return DepthSensor(frames.index(frame))
     try:
         lens = own_camera(bag, topic)
-        return DepthSensor(0, lens=lens, camera_T_depth=path_between(bag, frames[0], frame))
+        turned, turned_depth = camera_T_image(bag, topics.cameras[0]), camera_T_image(bag, topic)
+        between = path_between(bag, frames[0], frame)
+        camera_T_depth = turned.inverse().compose(between).compose(turned_depth)
+        return DepthSensor(0, lens=lens, camera_T_depth=camera_T_depth)
     except DataError as error:
         raise DataError(f"{error}; it may have a key 'depth0' for the depth on '{topic}'") from None
 

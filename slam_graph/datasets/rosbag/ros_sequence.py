@@ -15,7 +15,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from slam_graph.datasets.calibration.kalibr_calibration import read_kalibr
+from slam_graph.datasets.calibration.kalibr_calibration import read_kalibr, warn_noise_assumed
 from slam_graph.datasets.rosbag.bag import REINDEX, Bag, Message
 from slam_graph.datasets.rosbag.messages import image_fields, image_of, inertial_of, pose_of
 from slam_graph.datasets.rosbag.ros_aiding import BagAiding
@@ -107,18 +107,15 @@ class RosBagSequence(GroupedSequence):
         chain, cameras = options.calibration, options.cameras
         topics = find_topics(self._bag, options.sources, chain)
         self._imu_topic, self._truth_topic = topics.imu, topics.groundtruth
-        unknown = ImuNoise()
         if chain is not None:
-            rig = read_kalibr(
-                chain, fallback=unknown, needs_imu=topics.imu is not None and options.imu
-            )
+            needs_imu = topics.imu is not None and options.imu
+            rig = read_kalibr(chain, needs_imu=needs_imu, diagnostics=options.diagnostics)
         else:
             count = len(topics.cameras) if cameras is None else cameras
             used = replace(topics, cameras=topics.cameras[:count])
-            rig = read_bag_rig(self._bag, used, unknown)
-        if topics.imu is not None and rig.imu is unknown:
-            what = "no noise densities of the IMU are given; those of EuRoC's are assumed"
-            options.diagnostics.warn("imu_noise_assumed", f"{path}: {what}")
+            rig = read_bag_rig(self._bag, used, ImuNoise())
+            if topics.imu is not None and options.imu:
+                warn_noise_assumed(path, options.diagnostics)
         if len(topics.cameras) < len(rig.cameras) or (
             len(topics.cameras) > len(rig.cameras) and chain is not None
         ):

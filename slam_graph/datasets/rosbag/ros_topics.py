@@ -20,7 +20,11 @@ import numpy as np
 import yaml
 
 from slam_graph.arrays import FloatArray
-from slam_graph.datasets.calibration.calibration_yaml import YamlValue, read_yaml
+from slam_graph.datasets.calibration.calibration_yaml import (
+    YamlValue,
+    pose_from_matrix,
+    read_yaml,
+)
 from slam_graph.datasets.calibration.euroc_calibration import check_size, lens
 from slam_graph.datasets.rosbag.bag import REINDEX, Bag, Message
 from slam_graph.datasets.rosbag.messages import (
@@ -147,7 +151,8 @@ def read_bag_rig(bag: Bag, topics: Topics, noise: ImuNoise) -> Rig:
         info = _info_beside(bag, topic)
         camera = _camera(bag, topic, info)
         body_T_camera = _path(bag, transforms, body, info.frame)
-        mounted.append(RigCamera(camera, body_T_camera, 0.0, f"cam{k}"))
+        body_T_image = body_T_camera.compose(camera_T_image(bag, topic))
+        mounted.append(RigCamera(camera, body_T_image, 0.0, f"cam{k}"))
     return Rig(tuple(mounted), noise)
 
 
@@ -199,13 +204,18 @@ def _first(bag: Bag, topic: str) -> Message:
 def _beside(bag: Bag, topic: str) -> str:
     """The topic with the calibration of the camera that publishes images under a topic."""
     base = topic if bag.topics[topic] == IMAGE else topic.rpartition("/")[0]
-    beside = f"{base.rpartition('/')[0]}/camera_info"
+    return f"{base.rpartition('/')[0]}/camera_info"
+
+
+def _info_beside(bag: Bag, topic: str) -> _CameraInfo:
+    """The `CameraInfo` beside a topic of images."""
+    beside = _beside(bag, topic)
     if bag.topics.get(beside) != CAMERA_INFO:
         raise DataError(
             f"{bag.path}: no calibration: no topic '{beside}'; give --calibration; "
             f"the bag has {bag.listed()}"
         )
-    return beside
+    return _first(bag, beside).decode(_camera_info_of)
 
 
 class _CameraInfo(NamedTuple):
@@ -217,6 +227,7 @@ class _CameraInfo(NamedTuple):
         K: (3, 3) intrinsics of the images as they are taken.
         D: coefficients of their distortion.
         P: (3, 4) projection into rectified images.
+        R: (3, 3) turns the axes of the camera to those of rectified images.
         distortion_model: by the name that ROS has for it.
     """
 
@@ -225,19 +236,15 @@ class _CameraInfo(NamedTuple):
     K: FloatArray
     D: FloatArray
     P: FloatArray
+    R: FloatArray
     distortion_model: str
-
-
-def _info_beside(bag: Bag, topic: str) -> _CameraInfo:
-    """The `CameraInfo` beside a topic of images."""
-    return _first(bag, _beside(bag, topic)).decode(_camera_info_of)
 
 
 def _camera_info_of(message: Any) -> _CameraInfo:
     """The fields of a `CameraInfo`; ROS 1 writes its matrices in capitals."""
-    K, D, P = (
+    K, D, P, R = (
         np.asarray(getattr(message, name if hasattr(message, name) else name.upper()), np.float64)
-        for name in "kdp"
+        for name in "kdpr"
     )
     return _CameraInfo(
         _frame_of(message),
@@ -245,13 +252,35 @@ def _camera_info_of(message: Any) -> _CameraInfo:
         K.reshape(3, 3),
         D.ravel(),
         P.reshape(3, 4),
+        R.reshape(3, 3),
         str(message.distortion_model),
     )
 
 
+def _is_rectified(topic: str) -> bool:
+    """Whether the images on a topic are rectified, by its name."""
+    return "rect" in topic.rpartition("/")[2]
+
+
+def camera_T_image(bag: Bag, topic: str) -> gtsam.Pose3:
+    """From the axes of the images on a topic, which rectification turns, to those of their camera.
+
+    They are the same where `CameraInfo` is missing, or its R was never set.
+
+    Raises:
+        DataError: if R is not a rotation.
+    """
+    if not _is_rectified(topic) or bag.topics.get(_beside(bag, topic)) != CAMERA_INFO:
+        return gtsam.Pose3()
+    R = _info_beside(bag, topic).R
+    matrix = np.eye(4)
+    matrix[:3, :3] = R if np.any(R) else np.eye(3)
+    return pose_from_matrix(matrix, f"{bag.path}: R in CameraInfo of {topic}").inverse()
+
+
 def _camera(bag: Bag, topic: str, info: _CameraInfo) -> Camera:
     """The intrinsics of the camera whose images are on a topic."""
-    rectified = "rect" in topic.rpartition("/")[2]
+    rectified = _is_rectified(topic)
     matrix, D, size = info.P if rectified else info.K, info.D, info.size
     fx, fy, cx, cy = matrix[[0, 1, 0, 1], [0, 1, 2, 2]].tolist()
     intrinsics, where = (fx, fy, cx, cy), f"{bag.path}: CameraInfo of {topic}"

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""Files of fixes, known poses and odometry beside a recording, and how packets come to carry them.
+"""Files of fixes, known poses and odometry beside a recording.
 
 ``gnss.csv`` has a row for each fix, with one of these headers:
 
@@ -9,6 +9,9 @@
 - ``#timestamp [ns],east [m],north [m],up [m],sigma_east [m],sigma_north [m],sigma_up [m]``, with an
   optional line ``# datum: latitude, longitude, altitude`` before the rows;
 - NMEA sentences GGA, each after a time stamp: ``1403636579763555584,$GPGGA,…``.
+
+Units may be left out of a header, and sigmas be called otherwise. Fixes without such a header are
+refused, as degrees are not told from metres.
 
 ``odometry.csv`` has a row for each sample: ``#timestamp [ns],x [m],y [m],z [m],qx,qy,qz,qw``, the
 pose of the body in the frame of the odometry.
@@ -21,8 +24,8 @@ sigmas of position or orientation are ``inf``, that was not measured.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
+import re
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -35,7 +38,7 @@ from slam_graph.datasets.streams.vector_lengths import lengths_of
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import DataError
 from slam_graph.files import Files
-from slam_graph.sensors import AidingData, Packet, Rig
+from slam_graph.sensors import AidingData
 
 FIXES, ODOMETRY, POSES = "gnss.csv", "odometry.csv", "poses.csv"
 
@@ -49,6 +52,8 @@ _POSE_HEADER = (
 _LOCAL_HEADER = (
     "#timestamp [ns],east [m],north [m],up [m],sigma_east [m],sigma_north [m],sigma_up [m]"
 )
+_GEODETIC_COLUMNS = r"timestamp(\[ns])?,latitude(\[deg])?,longitude(\[deg])?,altitude(\[m])?,.*"
+_LOCAL_COLUMNS = r"timestamp(\[ns])?,east(\[m])?,north(\[m])?,up(\[m])?,.*"
 _DATUM = "# datum:"
 _NMEA_SIGMA_M = 2.5
 """Standard deviation of a position whose dilution of precision (HDOP) is 1, of a code receiver."""
@@ -107,7 +112,7 @@ def read_fixes(path: Path, diagnostics: Diagnostics) -> AidingData:
             in the order of time.
 
     Raises:
-        DataError: if a row cannot be read.
+        DataError: if a row cannot be read, or the header is another one.
     """
     header, datum = _header(path)
     stamps: list[IntArray] = []
@@ -128,7 +133,7 @@ def read_fixes(path: Path, diagnostics: Diagnostics) -> AidingData:
         sigmas.append(table["sigma"])
     if not stamps:
         raise DataError(f"{path}: no fixes in this file")
-    local = not nmea and "latitude" not in header
+    local = not nmea and _are_local(header, path)
     covariances = covariances_of(np.concatenate(sigmas))
     found = np.concatenate(stamps), np.concatenate(positions), covariances
     return fixes_from(*found, path, diagnostics, (local, datum))
@@ -225,6 +230,19 @@ def _header(path: Path) -> tuple[str, Datum | None]:
             elif line and line[0] not in "#%":
                 break
     return first, datum
+
+
+def _are_local(header: str, path: Path) -> bool:
+    """Whether a file of fixes says that they are local; an error if it says nothing of it."""
+    columns = header.lstrip("# ").replace(" ", "")
+    local = re.fullmatch(_LOCAL_COLUMNS, columns) is not None
+    if not local and re.fullmatch(_GEODETIC_COLUMNS, columns) is None:
+        raise DataError(
+            f"{path}: nothing says whether these fixes are in degrees or metres; begin it with "
+            "'#timestamp [ns],latitude [deg],longitude [deg],altitude [m],sigma_east [m],"
+            f"sigma_north [m],sigma_up [m]' or '{_LOCAL_HEADER}'"
+        )
+    return local
 
 
 def _gga(rows: Rows, index: int) -> tuple[int, FloatArray, FloatArray]:
@@ -357,36 +375,3 @@ def _rows(stamps_ns: IntArray, numbers: FloatArray) -> list[str]:
     """Rows of a stamp and numbers, exact to the last bit."""
     pairs = zip(stamps_ns.tolist(), numbers.tolist(), strict=True)
     return [",".join([str(stamp), *map(repr, row)]) for stamp, row in pairs]
-
-
-def with_aiding(packets: Iterator[Packet], data: AidingData, rig: Rig) -> Iterator[Packet]:
-    """Packets that carry what was measured up to the states of their frames.
-
-    Unchanged if there is nothing. Odometry is interpolated, so it goes on to the first sample at or
-    after the state. The state is no later than the last row of the frame or the last sample of the
-    IMU, however the time offset is estimated.
-
-    Args:
-        packets: in the order of time.
-        data: on the clock of the states.
-        rig: tells how much later than the stamp of its frame a state is.
-    """
-    if not len(data):
-        yield from packets
-        return
-    pose_ns, end_ns = (round(1e9 * s) for s in (rig.pose_offset_s, rig.end_offset_s))
-    fixes_ns = odometry_ns = latest_ns = None
-    for packet in packets:
-        stamp_ns = packet.frame.stamp_ns + pose_ns
-        reached = [packet.frame.stamp_ns + end_ns, *packet.imu.stamps_ns[-1:].tolist()]
-        latest_ns = max(reached if latest_ns is None else [latest_ns, *reached])
-        beyond = int(np.searchsorted(data.odometry_stamps_ns, latest_ns))
-        until_ns = latest_ns
-        if beyond < len(data.odometry_stamps_ns):
-            until_ns = int(data.odometry_stamps_ns[beyond])
-        fixes, odometry = data.within(fixes_ns, stamp_ns), data.within(odometry_ns, until_ns)
-        part = fixes.with_odometry(
-            odometry.odometry_stamps_ns, odometry.odometry_positions, odometry.odometry_quaternions
-        )
-        fixes_ns, odometry_ns = stamp_ns, until_ns
-        yield replace(packet, aiding=part)

@@ -4,9 +4,11 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from functools import partial
+from itertools import islice
 from pathlib import Path
 from typing import Protocol
 
@@ -22,7 +24,7 @@ from slam_graph.datasets.streams.csv_rows import (
     require_rows,
 )
 from slam_graph.datasets.streams.imu_outliers import without_outliers
-from slam_graph.datasets.streams.pairing import in_order
+from slam_graph.datasets.streams.pairing import FOLLOWERS, in_order
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.files import Files
 from slam_graph.sensors import ImuData
@@ -37,6 +39,9 @@ period by less than this share of it; as seen in blocks of so many pauses or mor
 
 SAMPLES_PER_BLOCK = 1024
 """Samples in memory that are cleaned at a time."""
+
+_Block = tuple[Callable[[int], str], ImuData]
+"""Samples, after a function that gives the place of each."""
 
 INTEGER_STAMPS = [("stamp", "i8"), ("gyro", "f8", (3,)), ("accel", "f8", (3,))]
 
@@ -60,22 +65,23 @@ class _ImuCleaner:
     latest_ns: int | None = None
     period_ns: float = field(default=np.inf)
 
-    def clean(self, data: ImuData, where: Callable[[int], str]) -> ImuData:
+    def clean(self, data: ImuData, where: Callable[[int], str], following_ns: IntArray) -> ImuData:
         """The usable samples of the next block.
 
         Args:
             data: samples in the order of the recording, stamps in any order.
             where: gives the place of a sample, such as file and line, for the log.
+            following_ns: the first stamps after this block.
         """
         wanted = np.ones(len(data), bool)
         if self.after_ns is not None:
             wanted = data.stamps_ns >= self.after_ns
-        finite = np.isfinite(data.gyro).all(axis=1) & np.isfinite(data.accel).all(axis=1)
+        finite = Files.are_measurable(np.hstack([data.gyro, data.accel])).all(axis=1)
         finite &= Files.are_times(data.stamps_ns)
         for k in np.flatnonzero(wanted & ~finite):
             self.diagnostics.warn("imu_not_finite", f"{where(int(k))}: dropped, not finite")
         candidates = np.flatnonzero(wanted & finite)
-        kept = self._in_order(data.stamps_ns, candidates, where)
+        kept = self._in_order(data.stamps_ns, candidates, where, following_ns)
         if len(kept) == np.count_nonzero(wanted):  # what is dropped is said already
             self._report_missing(data.stamps_ns[kept])
         self._report_gaps(data.stamps_ns[kept], lambda k: where(int(kept[k])))
@@ -86,6 +92,7 @@ class _ImuCleaner:
         stamps_ns: IntArray,
         candidates: NDArray[np.intp],
         where: Callable[[int], str],
+        following_ns: IntArray,
     ) -> NDArray[np.intp]:
         """The candidates whose stamps increase; the others are counted."""
         stamps = stamps_ns[candidates]
@@ -98,7 +105,7 @@ class _ImuCleaner:
                 why = "earlier than the one before, or from the future"
                 self.diagnostics.warn("imu_out_of_order", f"{sample}, {why}")
 
-        return candidates[in_order(stamps, dropped, self.latest_ns)]
+        return candidates[in_order(stamps, dropped, self.latest_ns, following_ns)]
 
     def _report_missing(self, stamps_ns: IntArray) -> None:
         """Count places in which a few samples are not there, if all others come evenly.
@@ -138,7 +145,7 @@ class _ImuCleaner:
 
 
 def clean_blocks(
-    blocks: Iterable[tuple[Callable[[int], str], ImuData]],
+    blocks: Iterable[_Block],
     diagnostics: Diagnostics,
     after_ns: int | None,
 ) -> Iterator[ImuData]:
@@ -150,8 +157,29 @@ def clean_blocks(
         after_ns: samples before this time are left out; None for all.
     """
     cleaner = _ImuCleaner(diagnostics, after_ns)
-    cleaned = (cleaner.clean(data, where) for where, data in blocks)
+    followed = _with_stamps_after(blocks)
+    cleaned = (cleaner.clean(data, where, after) for (where, data), after in followed)
     return without_outliers(cleaned, diagnostics)
+
+
+def _with_stamps_after(blocks: Iterable[_Block]) -> Iterator[tuple[_Block, IntArray]]:
+    """Blocks, each with the first stamps of those after it, as many as `in_order` looks at."""
+    waiting: deque[_Block] = deque()
+    for block in blocks:
+        waiting.append(block)
+        while len(after := _stamps_after_first(waiting)) == FOLLOWERS:
+            yield waiting.popleft(), after
+    while waiting:
+        after = _stamps_after_first(waiting)
+        yield waiting.popleft(), after
+
+
+def _stamps_after_first(blocks: Iterable[_Block]) -> IntArray:
+    """The first stamps of all blocks but the first one."""
+    stamps = [data.stamps_ns for _, data in islice(blocks, 1, None)]
+    together = np.concatenate([np.zeros(0, np.int64), *stamps])
+    times: IntArray = together[Files.are_times(together)]
+    return times[:FOLLOWERS]
 
 
 class ImuSource(Protocol):

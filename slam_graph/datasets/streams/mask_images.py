@@ -68,9 +68,8 @@ class MaskFolder:
                 f"{folder}: holds neither {BOXES} nor label images named by the times of frames in "
                 "ns (1403636579763555584.png)"
             )
-        self._stamps_ns = np.unique(np.concatenate([[*self._images], self._boxes["stamp"]])).astype(
-            np.int64
-        )
+        named_ns = np.array([*self._images], np.int64)  # an empty list would be of floats
+        self._stamps_ns = np.unique(np.concatenate([named_ns, self._boxes["stamp"]]))
 
     def __len__(self) -> int:
         return len(self._stamps_ns)

@@ -6,39 +6,52 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
+
+FOLLOWERS = 7
+"""Stamps by which it is judged whether the one before them is from the future."""
 
 
 def in_order(
     stamps_ns: NDArray[np.int64],
     dropped: Callable[[int, int], None],
     latest_ns: int | None = None,
+    following_ns: NDArray[np.int64] | None = None,
 ) -> NDArray[np.intp]:
     """Indices of stamps that increase.
 
-    Of two stamps in the wrong order the second is dropped, unless it continues those before them:
-    then the first is too late, and would block all that follow.
+    Of two stamps in the wrong order the second is dropped, unless it, or most of the `FOLLOWERS`
+    stamps from it on, continue those before the first: then that is from the future, and would
+    block all that follow.
 
     Args:
         stamps_ns: (N,) in the order of the recording.
         dropped: called with the index of each stamp that is left out, and the last one kept.
         latest_ns: the last stamp before these.
+        following_ns: the first stamps after these, in a recording that is read in parts.
     """
+    ahead = stamps_ns[:0] if following_ns is None else following_ns
+    together = np.concatenate([stamps_ns, ahead])
     latest = int(np.iinfo(np.int64).min) if latest_ns is None else latest_ns
-    if np.all(stamps_ns[1:] > stamps_ns[:-1]) and not np.any(stamps_ns[:1] <= latest):
+    if np.all(together[1:] > together[:-1]) and not np.any(stamps_ns[:1] <= latest):
         return np.arange(len(stamps_ns))
     kept = []
-    times = stamps_ns.tolist()
-    for k, (stamp, following) in enumerate(pairwise([*times, times[-1] + 1])):
-        if stamp <= latest or latest < following < stamp:
+    times = together.tolist()
+    for k, stamp in enumerate(times[: len(stamps_ns)]):
+        if stamp <= latest or _blocks(stamp, times[k + 1 : k + 1 + FOLLOWERS], latest):
             dropped(k, latest)
             continue
         latest = stamp
         kept.append(k)
     return np.array(kept, np.intp)
+
+
+def _blocks(stamp_ns: int, following_ns: list[int], latest_ns: int) -> bool:
+    """Whether a stamp is from the future, by the stamps after it and the last one kept."""
+    earlier = [latest_ns < following < stamp_ns for following in following_ns]
+    return any(earlier[:1]) or 2 * sum(earlier) > len(earlier)
 
 
 ABSENT = -1
