@@ -166,7 +166,8 @@ def test_an_output_that_cannot_be_written(tmp_path: Path) -> None:
 def test_what_was_there_stays_where_the_new_cannot_be_written(stock: Stock, tmp_path: Path) -> None:
     old = tmp_path / "a.tum"
     old.write_text("older results\n")
-    check_refused(stock.command(COMMANDS["export"](stock, tmp_path), tmp_path, limit=200))
+    again = [*COMMANDS["export"](stock, tmp_path), "--force"]
+    check_refused(stock.command(again, tmp_path, limit=200))
     assert old.read_text() == "older results\n"
     assert [path.name for path in tmp_path.iterdir() if path.suffix == ".tum"] == ["a.tum"]
 

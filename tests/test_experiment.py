@@ -201,6 +201,37 @@ def test_what_is_done_is_not_done_again_but_other_settings_are(
     assert files[1].stat().st_mtime_ns > before[1]
 
 
+def test_tracks_are_recorded_anew_where_calibration_truth_or_data_have_changed(
+    tmp_path: Path,
+) -> None:
+    recording = flight(tmp_path / "flight", duration_s=1.0)
+    output = recording / "results"
+
+    def folder(**truths: Path) -> Path:
+        named = {str(recording): truth for truth in truths.values()}
+        (source,) = find_sources([recording], None, (), named, None, output)
+        return RecordTask(source=source, seed=0, config=load_config(), root=tmp_path).folder
+
+    before = folder()
+    output.mkdir()
+    (output / "report.md").write_text("what a comparison writes is no part of the recording")
+    assert folder() == before
+    for name in ("imu.bin", "groundtruth.npz"):
+        os.utime(recording / name, ns=(0, 0))
+        before, changed = folder(), before
+        assert before != changed
+    rig, truth = recording / "calibration.yaml", tmp_path / "truth.tum"
+    text, status = rig.read_text(), rig.stat()
+    rig.write_text(text.replace("timeshift_cam_imu: 0.0", "timeshift_cam_imu: 0.1"))
+    os.utime(rig, ns=(status.st_atime_ns, status.st_mtime_ns))
+    assert rig.stat().st_size == status.st_size
+    assert folder() != before
+    for height in (0, 1):
+        truth.write_text("".join(f"{t} 0 0 {height} 0 0 0 1\n" for t in range(3)))
+        before, changed = folder(truth=truth), before
+        assert before != changed
+
+
 @pytest.mark.data
 def test_a_recording_of_tracks_with_its_truth(data_dir: Path, tmp_path: Path) -> None:
     truth = data_dir / "euroc_inertial" / "V1_01_easy"

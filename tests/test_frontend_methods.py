@@ -3,6 +3,7 @@
 """Laws of matching, prediction and rigs: on descriptors and motions that are known exactly."""
 
 import sys
+from dataclasses import replace
 
 import cv2
 import gtsam
@@ -10,11 +11,14 @@ import numpy as np
 import pytest
 from flight import Flight
 from images import (
+    BASELINE_M,
     CAMERA,
     CONFIG,
     FOCAL_PX,
+    HEIGHT,
     MONO,
     STEREO,
+    WIDTH,
     Spline,
     common,
     feed,
@@ -28,10 +32,11 @@ from images import (
 from slam_graph.errors import ConfigError
 from slam_graph.frontend.frontend_config import DESCRIPTORS, FrontendConfig
 from slam_graph.frontend.frontend_protocol import Feedback, build_frontend
-from slam_graph.frontend.keypoints import spread
+from slam_graph.frontend.keypoints import Keypoints, spread
 from slam_graph.frontend.matching import descriptor_distances, match
 from slam_graph.frontend.prediction import ImuMotion
 from slam_graph.frontend.stereo import reference_cameras
+from slam_graph.sensors.camera import Camera
 from slam_graph.sensors.imu_buffer import ImuBuffer
 from slam_graph.sensors.measurements import CameraFrame, ImuData
 from slam_graph.sensors.rig import ImuNoise, Rig, RigCamera
@@ -99,6 +104,23 @@ def test_descriptors_follow_the_known_motion(texture: Spline, method: str, H: np
     # mahotas' blobs are found less exactly than the others
     assert np.median(np.linalg.norm(error, axis=1)) < (1.5 if method == "surf" else 1.0)
     assert np.mean(np.linalg.norm(error, axis=1) > 3.0) < 0.1
+
+
+@pytest.mark.parametrize("method", sorted(DESCRIPTORS))
+def test_images_without_keypoints_end_nothing(texture: Spline, method: str) -> None:
+    black = np.zeros((HEIGHT, WIDTH), np.uint8)
+    config = CONFIG.model_copy(update={"method": method, "fast_threshold": 10})
+    images = [view(texture), black, black, view(texture), view(texture)]
+    frames = feed(build_frontend(MONO, config), *[(image,) for image in images])
+    counts = [len(frame.cameras[0]) for frame in frames]
+    assert counts[1] == counts[2] == 0
+    assert min(counts[3:]) > 15
+    descriptor = DESCRIPTORS[method]()
+    image, keypoints = images[0], Keypoints.concatenate([])
+    _, none = descriptor.describe(image, keypoints)
+    few = Keypoints.of(np.float32([[200.0, 150.0]]), np.ones(1, np.float32), 31.0)
+    _, some = descriptor.describe(image, few)
+    assert (none.shape, none.dtype) == ((0, some.shape[1]), some.dtype)
 
 
 def test_a_feature_that_was_hidden_for_two_frames_is_found_again(texture: Spline) -> None:
@@ -262,6 +284,45 @@ def test_cameras_are_matched_to_one_that_sees_the_same() -> None:
         )
     )
     assert reference_cameras(two_pairs) == (0, 1, 1, 0)
+
+
+def test_matches_come_back_when_the_calibration_is_corrected(texture: Spline) -> None:
+    askew = replace(
+        STEREO.cameras[1], body_T_camera=gtsam.Pose3(gtsam.Rot3.Rx(0.03), [BASELINE_M, 0, 0])
+    )
+    frontend = build_frontend(Rig((STEREO.cameras[0], askew)), CONFIG)
+    pair = view(texture), view(texture, shift(-FOCAL_PX * BASELINE_M / 2.0, 0))
+    wrong = feed(frontend, pair, pair)[-1]
+    frontend.receive_feedback(Feedback(rig=STEREO))
+    right = feed(frontend, pair, pair)[-1]
+    expected = feed(build_frontend(STEREO, CONFIG), pair, pair)[-1]
+    assert len(wrong.cameras[1]) < 0.2 * len(expected.cameras[1])
+    assert len(right.cameras[1]) > 0.95 * len(expected.cameras[1])
+
+
+@pytest.mark.parametrize("window_px", [17, 21])
+@pytest.mark.parametrize(
+    ("scale", "width"), [(0.5, WIDTH), (1.6, WIDTH), (1.0, WIDTH - 40)], ids=["half", "1.6", "cut"]
+)
+def test_a_camera_of_another_resolution_is_matched_like_one_of_the_same(
+    texture: Spline, scale: float, width: int, window_px: int
+) -> None:
+    disparity_px = FOCAL_PX * BASELINE_M / 2.0
+    size = round(scale * width), round(scale * HEIGHT)
+    focal_px, middle = scale * FOCAL_PX, [scale * (c + 0.5) - 0.5 for c in (CAMERA.cx, CAMERA.cy)]
+    camera = Camera(focal_px, focal_px, *middle, "none", (), *size)
+    rig = Rig((STEREO.cameras[0], replace(STEREO.cameras[1], camera=camera)))
+    seen = view(texture, shift(-disparity_px, 0))[:, :width]
+    how = cv2.INTER_AREA if scale < 1.0 else cv2.INTER_CUBIC
+    pair = view(texture), seen if scale == 1.0 else cv2.resize(seen, size, interpolation=how)
+    frontend = build_frontend(rig, CONFIG.model_copy(update={"window_px": window_px}))
+    left, right = feed(frontend, pair, pair)[-1].cameras
+    a, b = common(left, right)
+    there = left.pixels[:, 0] - disparity_px
+    assert len(b) > 0.9 * np.count_nonzero((there > 15) & (there < width - 15))
+    error = (left.pixels[a] - (disparity_px, 0) + 0.5) * scale - 0.5 - right.pixels[b]
+    assert np.median(np.linalg.norm(error, axis=1)) < 0.1
+    np.testing.assert_allclose(right.normalized, camera.undistort(right.pixels), atol=1e-6)
 
 
 def test_a_camera_that_looks_elsewhere_has_features_of_its_own(texture: Spline) -> None:

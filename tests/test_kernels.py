@@ -454,11 +454,13 @@ def test_median(count: int, different: int) -> None:
     assert all(median(row.copy()) == np.median(row) for row in values)
 
 
-def test_most_similar() -> None:
+@pytest.mark.parametrize(("height", "width"), [(60, 90), (60, 50), (35, 90)])
+def test_most_similar(height: int, width: int) -> None:
     rng = np.random.default_rng(5)
     one, other = rng.integers(0, 256, (2, 60, 90)).astype(np.uint8)
     other[20:40] = one[20:40]
     one[:9] = 7  # no texture
+    one = np.ascontiguousarray(one[:height, :width])
     points = rng.uniform(-5.0, 365.0, (50, 2))
     candidates = points[:, None] + rng.uniform(-30.0, 30.0, (50, 25, 2))
     candidates[:, 7], candidates[:5] = points, -1e6

@@ -2,17 +2,22 @@
 # SPDX-License-Identifier: Apache-2.0
 """Features that move: apart from the others as long as they do, and only then."""
 
+from itertools import pairwise
+
 import cv2
 import numpy as np
+import pytest
+from flight import Flight
+from images import CONFIG, MONO, painted, shift, view
 
 from slam_graph.backend import ObjectFrame
-from slam_graph.frontend import FrontendConfig
+from slam_graph.frontend import Feedback, FrontendConfig, build_frontend
 from slam_graph.frontend.extraction import FeatureExtractor
 from slam_graph.frontend.moving_tracks import MOST, MovingTracks
 from slam_graph.pipeline import run
 from slam_graph.pipeline.observers import NullViewer
 from slam_graph.pipeline.stage import EstimatedFrame
-from slam_graph.sensors import FeatureObservations
+from slam_graph.sensors import CameraFrame, FeatureObservations
 from slam_graph.simulation.simulator import simulate
 
 
@@ -60,6 +65,23 @@ def test_without_objects_nothing_is_kept() -> None:
     moving.add(np.arange(5))
     assert len(moving.ids) == 0
     assert moving.apart([])[1] == ()
+
+
+@pytest.mark.parametrize("method", ["klt", "orb", "sift"])
+def test_what_is_found_on_an_object_is_followed(method: str) -> None:
+    """Corners within the hull of an object live on, whatever finds them again."""
+    texture, hull = painted(), np.array([[120.0, 80], [360, 80], [360, 240], [120, 240]])
+    config = CONFIG.model_copy(update={"method": method, "keep_moving": True})
+    frontend, ids = build_frontend(MONO, config), []
+    for k in range(5):
+        image = view(texture, shift(2.0 * k, 0.0))
+        frame = frontend.track(CameraFrame(k * 50_000_000, (image,)))
+        ids.append(frame.moving[0].ids)
+        state = Flight().nav_state(0.05 * k)
+        frontend.receive_feedback(Feedback(state, moving=ids[-1], hulls=((hull, 40),)))
+    followed = [np.isin(before, after).mean() for before, after in pairwise(ids[1:])]
+    assert min(map(len, ids[1:])) > 10
+    assert min(followed) > 0.6
 
 
 class Kept(NullViewer):

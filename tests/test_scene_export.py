@@ -3,6 +3,7 @@
 """Exports for COLMAP and nerfstudio: what OpenCV projects by them is what was observed."""
 
 import json
+import os
 import shutil
 from pathlib import Path
 
@@ -202,6 +203,16 @@ def test_the_command_writes_what_is_asked_for(flight: Path, result: Path, tmp_pa
     assert printed.split() == [str(path) for path in files.values()]
     causal = sg.load_result(result).trajectory
     assert all(len(rows(path)) == len(causal) for path in files.values())
+    files["tum"].unlink()
+    files["kitti"].write_text("of the user")
+    _, printed, error = call(*options)
+    assert printed == ""
+    assert "replace it by --force" in str(error)
+    assert not files["tum"].exists()
+    assert files["kitti"].read_text() == "of the user"
+    assert call(*options, "--force")[0] == 0
+    assert len(rows(files["kitti"])) > 1
+    assert call("--tum", os.devnull)[0] == 0
     code, _, _ = call("--colmap", tmp_path / "c", "--recording", flight)
     assert code == 0
     assert (tmp_path / "c" / "sparse" / "0" / "points3D.txt").is_file()

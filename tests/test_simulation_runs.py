@@ -22,7 +22,11 @@ from slam_graph.pipeline.run_recording import run
 from slam_graph.sensors.camera import Camera
 from slam_graph.sensors.rig import Rig
 from slam_graph.simulation.simulated_sequence import SimulatedSequence
-from slam_graph.simulation.simulation_config import SimulationConfig
+from slam_graph.simulation.simulation_config import (
+    SimulatedGnssConfig,
+    SimulationConfig,
+    load_simulation_config,
+)
 from slam_graph.simulation.simulator import euroc_rig, simulate
 
 IMAGES: dict[str, Any] = {"kind": "images", "images": {"texel_m": 0.02}}
@@ -195,11 +199,28 @@ def test_the_command_writes_a_recording(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
+    ("option", "changed"), [("--gnss", {"sigma_m": 0.25}), ("--multipath", {"multipath": 0.25})]
+)
+def test_an_option_of_fixes_leaves_their_other_settings(
+    option: str, changed: dict[str, float], tmp_path: Path
+) -> None:
+    given = {"sigma_m": 0.5, "rate_hz": 5.0, "multipath": 0.75, "multipath_m": 50.0}
+    (tmp_path / "sim.yaml").write_text(json.dumps({"duration_s": 1.0, "gnss": given}))
+    done = invoke(tmp_path / "out", "--config", tmp_path / "sim.yaml", option, 0.25)
+    assert done.exit_code == 0, done.output
+    written = load_simulation_config(tmp_path / "out" / "simulation.yaml").gnss
+    assert written == SimulatedGnssConfig(**(given | changed))
+    assert (tmp_path / "out" / "gnss.csv").is_file()
+
+
+@pytest.mark.parametrize(
     ("arguments", "code", "message"),
     [
         (["--real-imu"], 2, "'figure8' is a generated one"),
         (["--trajectory", "nowhere"], 1, "nowhere: no such trajectory"),
         (["--loss", "2"], 2, "tracks.loss: input should be less than 1"),
+        (["--gnss", "0"], 2, "gnss.sigma_m: input should be greater than 0"),
+        (["--multipath", "0.2"], 2, "there are none: give their sigma, gnss.sigma_m (--gnss)"),
         (["--set", "imu.noise=2"], 2, "unknown key 'imu.noise'"),
         (["--set", "tracks.features=0"], 2, "tracks.features"),
     ],

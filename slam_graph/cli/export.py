@@ -70,6 +70,9 @@ def export(
     spacing: Annotated[
         float, typer.Option("--spacing", min=0.0, help="Metres between keyframes with images.")
     ] = 0.1,
+    force: Annotated[
+        bool, typer.Option("--force", help="Let --tum, --kitti and --euroc replace files.")
+    ] = False,
     format_: Format = None,
     calibration: Calibration = None,
     sources: Sources = None,
@@ -80,7 +83,7 @@ def export(
     observations of the points.
     """
     from slam_graph.errors import ConfigError
-    from slam_graph.results import load_result
+    from slam_graph.results import ResultFolder, load_result
 
     scenes = {name: path for name, path in (("colmap", colmap), ("nerfstudio", nerfstudio)) if path}
     files = {
@@ -95,6 +98,8 @@ def export(
     if recording is None:
         given = recording_options(format_, calibration, None, sources)
         refuse_ignored(given, "is for the recording of the run: name it by --recording DATA")
+    for path in files.values():
+        ResultFolder.refuse_to_replace(path, force)
     saved = load_result(result)
     for name, path in files.items():
         typer.echo(str(_chosen(saved, which).save(path, name)))  # type: ignore[arg-type]

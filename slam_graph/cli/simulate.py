@@ -108,6 +108,7 @@ def simulate(
         "outliers": outliers,
         "loss": loss,
     }
+    fixes = {"sigma_m": gnss, "multipath": multipath}
     given: dict[str, Any] = {
         "kind": kind,
         "trajectory": trajectory,
@@ -116,7 +117,7 @@ def simulate(
         "calibration": calibration,
         "depth": None if depth is None else {"sensor": depth},
         "with_imu": imu,
-        "gnss": {"sigma_m": gnss, "multipath": multipath or 0.0} if gnss or multipath else None,
+        "gnss": _given(fixes),
         "odometry": None if odometry is None else {"enabled": odometry},
         "shutter_readout_s": shutter_readout,
         "start_s": start,
@@ -124,7 +125,7 @@ def simulate(
         "rate_hz": rate,
         "seed": seed,
         "world_seed": world_seed,
-        "tracks": {name: value for name, value in tracks.items() if value is not None} or None,
+        "tracks": _given(tracks),
     }
     EurocWriter.refuse_existing(output)
     sequence = make(config, set_ or (), **given)
@@ -134,6 +135,11 @@ def simulate(
     report = sequence.flight.report
     path = {} if report is None else {"path": report.as_dict()}
     _report(sequence.info(), path, {} if report is None else report.lines(), output, as_json)
+
+
+def _given(options: Mapping[str, Any]) -> dict[str, Any] | None:
+    """The options of a table that were given; None if none was."""
+    return {name: value for name, value in options.items() if value is not None} or None
 
 
 def _report(

@@ -7,7 +7,6 @@ from __future__ import annotations
 import glob
 import itertools
 import logging
-import os
 import re
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -21,7 +20,7 @@ from slam_graph.config import load_config
 from slam_graph.datasets import DATASETS
 from slam_graph.errors import ConfigError, DataError
 from slam_graph.experiment.batch_task import BatchTask
-from slam_graph.experiment.settings_hash import settings_hash
+from slam_graph.experiment.file_state import is_image, state_of
 from slam_graph.results import ResultFolder
 from slam_graph.settings import ConfigTree, Settings
 
@@ -32,8 +31,6 @@ FOLDER_OF_MASKS = "masks"
 
 _DEMO = "demo"
 _LISTS = (".yaml", ".yml")
-_IMAGES = {".png", ".jpg", ".jpeg", ".pgm", ".bmp", ".tif", ".tiff", ".webp"}
-"""Files of which the names only are looked at, as there are many."""
 
 
 class Entry(Settings):
@@ -129,7 +126,7 @@ def plan(
         tasks.append(
             BatchTask(
                 name=name,
-                state=_state([entry.data, *files]),
+                state=state_of([entry.data, *files], output),
                 config=settings,
                 output=output,
                 **extras,
@@ -194,15 +191,6 @@ def _is_path(sensor: str, path: Path) -> bool:
     return sensor == FOLDER_OF_MASKS or (sensor != "rate" and (path.is_file() or path.suffix != ""))
 
 
-def size_and_time(path: Path) -> tuple[int, int] | None:
-    """Size and time of the last change (ns) of a file or of all below a folder; None without it."""
-    if not path.exists():
-        return None
-    files = [file.stat() for file in _files(path)]
-    times = [file.st_mtime_ns for file in (*files, path.stat())]
-    return sum(file.st_size for file in files), max(times)
-
-
 def _with_paths(settings: dict[str, Any], folder: Path) -> dict[str, Any]:
     """Settings in which the file of an algorithm is named from anywhere."""
     algorithm = settings.get("algorithm")
@@ -265,7 +253,7 @@ def _recordings(path: Path, output: Path, format: str | None, seen: set[Path]) -
 
 def _recognised(path: Path, format: str | None) -> bool:
     """Whether a path is a recording, of the format if one is given."""
-    if path.is_file() and path.suffix.lower() in _IMAGES:
+    if path.is_file() and is_image(path):
         return False
     try:
         if format is not None:
@@ -275,7 +263,7 @@ def _recognised(path: Path, format: str | None) -> bool:
         return False
 
 
-# --- names and states --------------------------------------------------------------------------
+# --- names --------------------------------------------------------------------------
 
 
 def _names(entries: Sequence[Entry]) -> list[str]:
@@ -324,24 +312,3 @@ def _name(place: tuple[str, ...], endings: Mapping[tuple[str, ...], int]) -> str
     return ResultFolder.name_of(
         re.sub(r"[^\w.-]+", "_", "_".join(parts)).lstrip(".") or "recording"
     )
-
-
-def _state(paths: Iterable[str]) -> str:
-    """A hash of the names, sizes and times of the files at some paths; of images the names only."""
-    files = sorted(str(file) for path in paths for file in _files(Path(path)))
-    return settings_hash([(file, *_size_and_time(file)) for file in files])
-
-
-def _files(path: Path) -> Iterator[Path]:
-    """The files at a path or below it."""
-    if path.is_file():
-        yield path
-    for folder, _, names in os.walk(path):
-        yield from (Path(folder, name) for name in names)
-
-
-def _size_and_time(file: str) -> tuple[int, ...]:
-    if os.path.splitext(file)[1].lower() in _IMAGES or not os.path.exists(file):
-        return ()
-    status = os.stat(file)
-    return status.st_size, status.st_mtime_ns

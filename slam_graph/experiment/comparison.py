@@ -87,7 +87,8 @@ def compare(
     if without_fej:
         configs = with_variants(configs)
     inputs = [data] if isinstance(data, (str, Path)) else data
-    found = find_sources(inputs, settings.get("duration_s"), simulation, groundtruth, sources)
+    duration_s, output = settings.get("duration_s"), Path(output)
+    found = find_sources(inputs, duration_s, simulation, groundtruth, sources, output)
     executor = executor_for(workers, scheduler, tls)
     comparison = run_tasks(found, configs, seeds, output, executor, progress or _ignore)
     write_report(comparison)

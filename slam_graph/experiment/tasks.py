@@ -9,6 +9,7 @@ affect other runs, and a cluster needs no more than a shared folder.
 
 from __future__ import annotations
 
+import hashlib
 import os
 import re
 import shutil
@@ -21,11 +22,18 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, TypeAdapter
 
 from slam_graph.config import RunConfig
-from slam_graph.datasets import RecordedSequence, Sequence, TrackRecorder, open_dataset
+from slam_graph.datasets import (
+    RecordedSequence,
+    Sequence,
+    TrackRecorder,
+    kalibr_text,
+    open_dataset,
+)
 from slam_graph.errors import ConfigError, DataError, closest
-from slam_graph.experiment.batch_plan import FOLDER_OF_MASKS, absolute_sources, size_and_time
+from slam_graph.experiment.batch_plan import FOLDER_OF_MASKS, absolute_sources
 from slam_graph.experiment.batch_task import BatchTask
 from slam_graph.experiment.comparison_results import read_result, write_result
+from slam_graph.experiment.file_state import size_and_time, state_of
 from slam_graph.experiment.settings_hash import settings_hash
 from slam_graph.frontend import build_frontend
 from slam_graph.interrupts import Interrupts
@@ -53,6 +61,8 @@ class Source(Settings):
     """Whether a seed changes anything."""
     extent: tuple[int, int, int] | None = None
     """Number of frames, first and last time of a recording; they reveal that it has changed."""
+    state: str = ""
+    """Hash of calibration, truth and files, of what was recorded, for the same reason."""
     sources: dict[str, str] = Field(default_factory=dict)
     """Where sensors of a recording are that are not found by themselves, such as fixes."""
     written: dict[str, tuple[int, int]] = Field(default_factory=dict)
@@ -72,12 +82,12 @@ class Source(Settings):
         return open_dataset(self.recording, cameras=cameras, groundtruth=truth, sources=sources)
 
     def identity(self) -> dict[str, Any]:
-        """What tells it from others, for a hash: places of sensors only where some were named."""
+        """What tells it from others, for a hash: places and states only where there are some."""
         settings = self.model_dump(mode="json")
         return {
             name: value
             for name, value in settings.items()
-            if value or name not in ("sources", "written")
+            if value or name not in ("sources", "written", "state")
         }
 
 
@@ -87,6 +97,7 @@ def find_sources(
     overrides: Iterable[str] = (),
     groundtruths: Mapping[str, str | Path] | None = None,
     sensors: Mapping[str, str] | None = None,
+    output: Path | None = None,
 ) -> list[Source]:
     """The sources with the names that a user gives.
 
@@ -97,9 +108,10 @@ def find_sources(
         overrides: `key=value` of `SimulationConfig`, for all simulations.
         groundtruths: paths of ground truth, by the path of the recording as in `names`.
         sensors: where sensors of all recordings are that are not found by themselves.
+        output: folder that is written to; what is in it says nothing of a recording around it.
 
     Raises:
-        DataError: if a recording cannot be opened.
+        DataError: if a recording cannot be opened, or its truth not be read.
         ConfigError: if an override does not fit, or a source is named twice.
     """
     changes = list(overrides)
@@ -107,9 +119,9 @@ def find_sources(
     sources: dict[str, Source] = {}
     for name in map(str, names):
         if name.startswith(_PREFIX):
-            source = _simulated(name.removeprefix(_PREFIX), duration_s, changes)
+            source = _simulated(name.removeprefix(_PREFIX), duration_s, changes, output)
         else:
-            source = _recorded(name, truths.pop(name, None), sensors or {})
+            source = _recorded(name, truths.pop(name, None), sensors or {}, output)
         if source.name in sources:
             raise ConfigError(f"{name}: another source is also called '{source.name}'; rename one")
         sources[source.name] = source
@@ -120,10 +132,13 @@ def find_sources(
     return list(sources.values())
 
 
-def _recorded(path: str, groundtruth: str | None, sensors: Mapping[str, str]) -> Source:
+def _recorded(
+    path: str, groundtruth: str | None, sensors: Mapping[str, str], output: Path | None
+) -> Source:
     truth = None if groundtruth is None else Path(groundtruth)
     places = absolute_sources(sensors, Path.cwd())
-    info = open_dataset(path, groundtruth=truth, sources=places or None).info()
+    sequence = open_dataset(path, groundtruth=truth, sources=places or None)
+    info = sequence.info()
     files = {
         name: size_and_time(Path(where))
         for name, where in places.items()
@@ -136,12 +151,31 @@ def _recorded(path: str, groundtruth: str | None, sensors: Mapping[str, str]) ->
         groundtruth=None if truth is None else str(truth.resolve()),
         random=info.content == "images",
         extent=(info.frames, info.start_ns, info.end_ns),
+        state=settings_hash(*_knowledge(sequence), state_of([where], output)),
         sources=places,
         written={name: file for name, file in files.items() if file is not None},
     )
 
 
-def _simulated(trajectory: str, duration_s: float | None, overrides: list[str]) -> Source:
+def _knowledge(sequence: Sequence) -> tuple[str, str]:
+    """What is known of a recording wherever that stands: its calibration, and a hash of its truth.
+
+    Raises:
+        DataError: if the truth cannot be read.
+    """
+    truth = sequence.groundtruth()
+    columns = {} if truth is None else truth.as_dict()
+    content = hashlib.sha256()
+    for name, values in columns.items():
+        content.update(name.encode() + values.tobytes())
+    return kalibr_text(sequence.rig), content.hexdigest()
+
+
+def _simulated(
+    trajectory: str, duration_s: float | None, overrides: list[str], output: Path | None
+) -> Source:
+    """A generated flight, or one along a recorded path."""
+    state = ""
     tree = ConfigTree({"trajectory": trajectory, "duration_s": duration_s})
     if trajectory in SimulationConfig.TRAJECTORIES:
         # the error of the start is drawn from its covariance: without it the NEES is too small
@@ -155,10 +189,12 @@ def _simulated(trajectory: str, duration_s: float | None, overrides: list[str]) 
                 f"{closest(trajectory, SimulationConfig.TRAJECTORIES)}"
             )
         tree.merge(ConfigTree({"trajectory": str(path), "real_imu": True}))
+        state = state_of([str(path)], output)
         name = path.name
     for text in overrides:
         tree.merge(ConfigTree.override(text))
-    return Source(name=f"sim_{_plain(name)}", simulation=tree.validated(SimulationConfig))
+    config = tree.validated(SimulationConfig)
+    return Source(name=f"sim_{_plain(name)}", simulation=config, state=state)
 
 
 def _plain(name: str) -> str:

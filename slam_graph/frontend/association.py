@@ -45,7 +45,8 @@ class Candidates:
 class Associator(Protocol):
     """Finds the features of one camera in its next image, and new ones there.
 
-    For each image `follow`, `recover`, `propose` and `accept` are called in this order.
+    For each image `follow`, `recover`, `propose` and `accept` are called in this order, and after
+    them `corners` and `accept_corners` where an object moves.
     """
 
     def follow(self, before: Tracks, image: Image, guess: Prediction) -> Association:
@@ -88,6 +89,21 @@ class Associator(Protocol):
             ids: (K,) of the new features.
             chosen: (M,) which of the candidates proposed last they are.
         """
+        ...
+
+    def corners(self, image: Image, mask: Image, count: int, distance_px: float) -> Pixels:
+        """Places (N, 2) that can be followed from the new image on, the best first.
+
+        Args:
+            image: the new one.
+            mask: (height, width), zero where they are not wanted.
+            count: most that are wanted.
+            distance_px: least distance between two of them.
+        """
+        ...
+
+    def accept_corners(self, ids: IntArray, points: Pixels) -> None:
+        """Some of these places (M, 2) have become features with ids (M,)."""
         ...
 
     def forget(self, ids: IntArray) -> None:

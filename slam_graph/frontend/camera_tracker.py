@@ -187,10 +187,12 @@ class CameraTracker:
         if not self._moving.hulls or tracks.image is None:
             return tracks
         distance_px = 0.5 * self._config.min_distance_px
-        points = self._moving.corners(tracks.image, tracks.pixels, distance_px)
+        find = partial(self._associator.corners, tracks.image)
+        points = self._moving.corners(tracks.pixels, tracks.image.shape, distance_px, find)
         points = points[self._extractor.allows(points)]
         ids = np.arange(next_id, next_id + len(points), dtype=np.int64)
         self._moving.add(ids)
+        self._associator.accept_corners(ids, points)
         normalized = self._camera.undistort(points.astype(np.float64))
         new = Tracks.of(tracks.image, tracks.stamp_ns, ids, points, normalized)
         old = tracks.select(

@@ -50,13 +50,15 @@ class _OpenCvDescriptor:
 
     def __init__(self, extractor: cv2.Feature2D, max_distance: float) -> None:
         self._extractor = extractor
+        number = np.uint8 if extractor.descriptorType() == cv2.CV_8U else np.float32
+        self._none: Vectors = np.zeros((0, extractor.descriptorSize()), number)
         self.max_distance = max_distance
 
     def describe(self, image: Image, keypoints: Keypoints) -> tuple[IntArray, Vectors]:
         """Describe what can be described."""
         described, vectors = self._extractor.compute(image, self._prepared(keypoints).to_opencv())
         if vectors is None:
-            return np.zeros(0, np.int64), np.zeros((0, 1), np.uint8)
+            return np.zeros(0, np.int64), self._none
         kept = np.array([k.class_id for k in described], np.int64)
         order = np.argsort(kept, kind="stable")
         return kept[order], np.asarray(vectors)[order]

@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import cv2
+import gtsam
 import numpy as np
 
 from slam_graph.arrays import IntArray
@@ -107,11 +108,10 @@ class ImageFrontend:
                     associator = DescriptorMatching(camera, extractor, config, mask)
             else:
                 # it has features of its own only while the reference camera has no image
-                pose = rig.cameras[reference].body_T_camera
                 self._matchers[i] = StereoMatcher(
                     camera,
                     rig.cameras[reference].camera,
-                    mounted.body_T_camera.between(pose),
+                    self._other_T_reference(i, rig),
                     lucas_kanade,
                     extractor,
                     config,
@@ -217,6 +217,8 @@ class ImageFrontend:
         if feedback.rig is not None:
             for tracker, mounted in zip(self._trackers, feedback.rig.cameras, strict=True):
                 tracker.mount(mounted)
+            for index, matcher in self._matchers.items():
+                matcher.mount(self._other_T_reference(index, feedback.rig))
         self._moving.keeps = self._moving.wanted and feedback.state is not None
         self._moving.add(feedback.moving)
         self._moving.remove(feedback.static)
@@ -227,6 +229,11 @@ class ImageFrontend:
             followed = np.unique(np.concatenate([tracks.ids for tracks in self._tracks]))
             self._gated += int(np.count_nonzero(np.isin(followed, feedback.rejected)))
             self.drop(feedback.rejected)
+
+    def _other_T_reference(self, index: int, rig: Rig) -> gtsam.Pose3:
+        """Pose of the camera that another one is matched to, in the frame of that one."""
+        reference = rig.cameras[self._references[index]]
+        return rig.cameras[index].body_T_camera.between(reference.body_T_camera)
 
     def _checked(self, frame: CameraFrame | FeatureFrame) -> tuple[Image | None, ...]:
         """The images of a frame, once their number and sizes are checked."""

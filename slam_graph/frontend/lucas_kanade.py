@@ -47,6 +47,9 @@ BLUR_PER_PX = 0.02
 """By how much a corner is harder to place for each pixel that it moved from image to image: the
 longer the way, the longer its blur, along which its place is uncertain."""
 
+_CORNER_QUALITY = 0.02
+"""Smallest corner on an object that moves, relative to the best one there."""
+
 _VERIFICATION = 0.3
 """Errors allowed to a new corner, as a share of those allowed to one that is tracked already. There
 are more corners than are needed, and one that barely passes is soon lost."""
@@ -128,7 +131,7 @@ class LucasKanade:
 
         Args:
             source: (height, width) image.
-            target: image of the same size.
+            target: image of the same scale, of any size.
             points: (N, 2) float32 pixels in `source`.
             guess: (N, 2) where to start in `target`.
             levels: of the pyramid, besides the image itself; at most the larger one of
@@ -138,7 +141,8 @@ class LucasKanade:
             return Flow(points, np.zeros(0, np.bool_), np.zeros(0, np.float32))
         if self._window_px != WINDOW_PX:
             return self._flow_by_opencv(source, target, points, guess, levels)
-        while levels > 0 and -(-min(source.shape) >> levels) <= WINDOW_PX:
+        shortest = min(*source.shape, *target.shape)
+        while levels > 0 and -(-shortest >> levels) <= WINDOW_PX:
             levels -= 1  # a level, of a size rounded up, must be larger than the window
         one, other = self._pyramid(source, levels), self._pyramid(target, levels)
         points = np.ascontiguousarray(points, np.float32)
@@ -162,8 +166,10 @@ class LucasKanade:
         self, source: Image, target: Image, points: Pixels, guess: Pixels, levels: int
     ) -> Flow:
         """The same for windows of any size, in more time."""
+        shape = target.shape
+        source, target = _of_one_size(source, target)
         forward, found = self._by_opencv(source, target, points, guess, levels)
-        found &= inside(forward, target.shape, BORDER_PX)
+        found &= inside(forward, shape, BORDER_PX)
         back, returned = self._by_opencv(target, source, forward, points, _BACKWARD_LEVELS)
         found &= returned
         error_px = np.where(found, np.linalg.norm(back - points, axis=1), np.float32(np.inf))
@@ -185,6 +191,20 @@ class LucasKanade:
             minEigThreshold=_MIN_EIGENVALUE,
         )
         return np.asarray(moved, np.float32), status[:, 0] == 1
+
+
+def _of_one_size(one: Image, other: Image) -> tuple[Image, Image]:
+    """Two images, continued to the right and below to the same size, as OpenCV wants them."""
+    if one.shape == other.shape:
+        return one, other
+    height, width = np.maximum(one.shape, other.shape)
+
+    def continued(image: Image) -> Image:
+        below, right = height - image.shape[0], width - image.shape[1]
+        wider = cv2.copyMakeBorder(image, 0, below, 0, right, cv2.BORDER_REPLICATE)
+        return np.asarray(wider, np.uint8)
+
+    return continued(one), continued(other)
 
 
 class CornerTracking:
@@ -268,6 +288,14 @@ class CornerTracking:
 
     def accept(self, ids: IntArray, chosen: BoolArray) -> None:
         """Nothing to remember: the patch of a corner is taken when it is first followed."""
+
+    def corners(self, image: Image, mask: Image, count: int, distance_px: float) -> Pixels:
+        """The corners (N, 2) that a mask shows, the strongest first."""
+        found = cv2.goodFeaturesToTrack(image, count, _CORNER_QUALITY, distance_px, mask=mask)
+        return np.asarray([] if found is None else found, np.float32).reshape(-1, 2)
+
+    def accept_corners(self, ids: IntArray, points: Pixels) -> None:
+        """Nothing to remember, as with `accept`."""
 
     def forget(self, ids: IntArray) -> None:
         """Drop the patches of these."""

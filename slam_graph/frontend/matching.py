@@ -16,9 +16,10 @@ from slam_graph.frontend.descriptors import Descriptor, Vectors
 from slam_graph.frontend.epipolar_test import distances_px, fitted_motion
 from slam_graph.frontend.extraction import BORDER_PX, FeatureExtractor
 from slam_graph.frontend.frontend_config import DESCRIPTORS, FrontendConfig
-from slam_graph.frontend.keypoints import Image, Keypoints, Pixels, Tracks
+from slam_graph.frontend.keypoints import Image, Keypoints, Pixels, Tracks, spread
 from slam_graph.frontend.outliers import MIN_POINTS
 from slam_graph.frontend.prediction import Prediction, neighbour_flow
+from slam_graph.kernels.spacing import in_mask
 from slam_graph.sensors import Camera
 
 _KEYPOINTS = 500
@@ -55,6 +56,13 @@ def descriptor_distances(a: Vectors, b: Vectors) -> FloatArray:
     words_a, words_b = (np.ascontiguousarray(v).view(np.uint64) for v in (a, b))
     bits = np.bitwise_count(words_a[:, None] ^ words_b[None])
     return np.asarray(bits.sum(axis=2), np.float64)
+
+
+def _stacked(a: Vectors, b: Vectors) -> Vectors:
+    """Descriptors (N, D) and (M, D) as one array; where there are none, D may be any number."""
+    if len(a) == 0 or len(b) == 0:
+        return b if len(a) == 0 else a
+    return np.concatenate([a, b])
 
 
 def match(
@@ -154,12 +162,10 @@ class _Lost:
 
     def joined(self, other: _Lost) -> _Lost:
         """These and others, in the order of their ids."""
-        if len(self.ids) == 0:
-            return other
         ids = np.concatenate([self.ids, other.ids])
         return _Lost(
             ids,
-            np.concatenate([self.vectors, other.vectors]),
+            _stacked(self.vectors, other.vectors),
             np.concatenate([self.pixels, other.pixels]),
             np.concatenate([self.normalized, other.normalized]),
             np.concatenate([self.seen, other.seen]),
@@ -271,6 +277,21 @@ class DescriptorMatching:
         self._current.free[self._proposed[chosen]] = False
         self._update(ids, self._proposed[chosen])
 
+    def corners(self, image: Image, mask: Image, count: int, distance_px: float) -> Pixels:
+        """The keypoints (N, 2) that a mask shows and that are no feature, the strongest first."""
+        free = self._current.keypoints.select(self._current.free)
+        there = free.select(in_mask(mask, np.ascontiguousarray(free.pixels)))
+        pixels = there.pixels[np.argsort(-there.scores, kind="stable")]
+        return pixels[spread(pixels, count, distance_px)]
+
+    def accept_corners(self, ids: IntArray, points: Pixels) -> None:
+        """Remember the descriptors of new features, which are keypoints."""
+        if len(ids) == 0:
+            return
+        keypoints = np.argmin(cdist(points, self._current.keypoints.pixels), axis=1)
+        self._current.free[keypoints] = False
+        self._update(ids, keypoints)
+
     def forget(self, ids: IntArray) -> None:
         """Do not look for these features any more."""
         if self._lost is not None:
@@ -293,9 +314,7 @@ class DescriptorMatching:
         vectors = self._current.vectors[keypoints]
         joined = np.concatenate([self._ids[old], ids])
         order = np.argsort(joined, kind="stable")
-        if old.any():
-            vectors = np.concatenate([self._vectors[old], vectors])
-        self._ids, self._vectors = joined[order], vectors[order]
+        self._ids, self._vectors = joined[order], _stacked(self._vectors[old], vectors)[order]
 
     def _remember_lost(self, before: Tracks, after: Tracks) -> _Lost:
         """The lost features and those just lost; the descriptors of all others are dropped."""

@@ -11,6 +11,8 @@ Before there is a state nobody could say so, and all outliers are rejected.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import cv2
 import numpy as np
 
@@ -20,8 +22,7 @@ from slam_graph.sensors import FeatureObservations
 
 MOST = 150
 """Moving features that are tracked; of more the youngest are left out."""
-_CORNER_QUALITY = 0.02
-"""Smallest corner in the hull of an object, relative to the best one there."""
+_FindCorners = Callable[[Image, int, float], Pixels]
 
 
 class MovingTracks:
@@ -91,13 +92,16 @@ class MovingTracks:
         static = tuple(seen.select(~rows) for seen, rows in zip(found, moving, strict=True))
         return static, tuple(seen.select(rows) for seen, rows in zip(found, moving, strict=True))
 
-    def corners(self, image: Image, taken: Pixels, distance_px: float) -> Pixels:
+    def corners(
+        self, taken: Pixels, shape: tuple[int, ...], distance_px: float, find: _FindCorners
+    ) -> Pixels:
         """New corners (N, 2) in the hulls, which are wanted there beside those that are taken.
 
         Args:
-            image: of the first camera.
             taken: (M, 2) pixels of the features that are tracked.
+            shape: (height, width) of the image of the first camera.
             distance_px: smallest distance between features.
+            find: at most so many corners, at such a distance, where a mask is not zero.
         """
         found = [np.zeros((0, 2), np.float32)]
         for hull, wanted in self.hulls:
@@ -108,13 +112,9 @@ class MovingTracks:
             missing = wanted - sum(inside)
             if missing <= 0:
                 continue
-            mask = np.zeros(image.shape, np.uint8)
+            mask = np.zeros(shape, np.uint8)
             cv2.fillPoly(mask, [polygon], 255)
             for x, y in taken.tolist():
                 cv2.circle(mask, (round(x), round(y)), round(distance_px), 0, -1)
-            corners = cv2.goodFeaturesToTrack(
-                image, missing, _CORNER_QUALITY, distance_px, mask=mask
-            )
-            if corners is not None:
-                found.append(np.asarray(corners, np.float32).reshape(-1, 2))
+            found.append(find(mask, missing, distance_px))
         return np.concatenate(found)

@@ -7,7 +7,8 @@ one. Every frame is matched anew, from the reference to the other camera, so tha
 feature does not drift as it would if both cameras tracked it for themselves. Lucas-Kanade starts
 from the disparity that a feature had before. Features without one are searched along their epipolar
 line first: Lucas-Kanade converges over a few pixels, but the same point in two cameras that are
-0.1 m apart, 0.5 m away, is off by a hundred.
+0.1 m apart, 0.5 m away, is off by a hundred. Where the focal lengths differ, the other camera's
+image is resampled to the scale of the reference.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ import gtsam
 import numpy as np
 
 from slam_graph.arrays import BoolArray, FloatArray
+from slam_graph.frontend.common_scale import CommonScale
 from slam_graph.frontend.epipolar_test import distances_px
 from slam_graph.frontend.extraction import FeatureExtractor
 from slam_graph.frontend.frontend_config import FrontendConfig
@@ -128,6 +130,7 @@ class _EpipolarSearch:
 
     Attributes:
         R, t: of `other_T_reference`.
+        essential: (3, 3) matrix of the same.
     """
 
     def __init__(self, camera: Camera, other_T_reference: gtsam.Pose3, min_depth_m: float) -> None:
@@ -137,6 +140,7 @@ class _EpipolarSearch:
         self.R: FloatArray = np.ascontiguousarray(rotation)
         self._turn: FloatArray = np.ascontiguousarray(rotation.T)  # for rows on its left
         self.t: FloatArray = np.array(other_T_reference.translation())
+        self.essential = essential_matrix(other_T_reference)
         disparity_px = camera.fx * float(np.linalg.norm(self.t)) / min_depth_m
         count = int(disparity_px / (_SEARCH_STEP_PX * 2**_HALVINGS)) + 2
         self._inverse_depths = np.linspace(0.0, 1.0 / min_depth_m, count)
@@ -230,16 +234,20 @@ class StereoMatcher:
         self._camera = camera
         self._reference = reference
         self._wide = camera.model.sees_sideways or reference.model.sees_sideways
-        self._essential = essential_matrix(other_T_reference)
-        self._baseline_m = float(np.linalg.norm(other_T_reference.translation()))
+        self._scale = CommonScale(camera, reference)
         self._lucas_kanade = lucas_kanade
         self._extractor = extractor
         self._config = config
-        self._search = _EpipolarSearch(camera, other_T_reference, config.stereo_min_depth_m)
+        self.mount(other_T_reference)
         self._ids = np.zeros(0, np.int64)
         self._offsets = np.zeros((0, 2), np.float32)
         self._frames = 0
         self.counts = _MatchCounts()
+
+    def mount(self, other_T_reference: gtsam.Pose3) -> None:
+        """Take the pose of the reference in the other camera's frame as it is calibrated now."""
+        nearest_m = self._config.stereo_min_depth_m
+        self._search = _EpipolarSearch(self._scale.camera, other_T_reference, nearest_m)
 
     def match(self, reference: Tracks, image: Image, stamp_ns: int, first_new_id: int) -> Tracks:
         """The features of the reference camera that another camera sees at the same time.
@@ -255,25 +263,27 @@ class StereoMatcher:
         reference_image = reference.image
         if reference_image is None or len(reference) == 0:
             return Tracks.empty(image, stamp_ns)
-        worthwhile, guess = self._guess(reference, reference_image, image, first_new_id)
+        scaled = self._scale.image(image)
+        worthwhile, guess = self._guess(reference, reference_image, scaled, first_new_id)
         rows = worthwhile.nonzero()[0]  # of `reference`; `take` needs less time than masks
         starts, guess = reference.pixels.take(rows, axis=0), guess.take(rows, axis=0)
-        flow = self._lucas_kanade.flow(reference_image, image, starts, guess, LEVELS)
+        flow = self._lucas_kanade.flow(reference_image, scaled, starts, guess, LEVELS)
         kept = (flow.found & (flow.error_px < self._config.forward_backward_px)).nonzero()[0]
-        kept = kept[self._extractor.allows(flow.points.take(kept, axis=0))]
-        rows, pixels = rows.take(kept), flow.points.take(kept, axis=0)
+        kept = kept[self._extractor.allows(self._scale.raw(flow.points.take(kept, axis=0)))]
+        rows, ends = rows.take(kept), flow.points.take(kept, axis=0)
+        pixels = self._scale.raw(ends)
         normalized = self._camera.undistort(pixels.astype(np.float64))
         good = self._inliers(reference.normalized.take(rows, axis=0), normalized).nonzero()[0]
         self.counts = _MatchCounts(len(good), len(rows) - len(good))
         rows, pixels = rows.take(good), pixels.take(good, axis=0)
         self._ids = reference.ids.take(rows)
-        self._offsets = pixels - reference.pixels.take(rows, axis=0)
+        self._offsets = ends.take(good, axis=0) - reference.pixels.take(rows, axis=0)
         return Tracks.of(image, stamp_ns, self._ids, pixels, normalized.take(good, axis=0))
 
     def _guess(
         self, reference: Tracks, reference_image: Image, image: Image, first_new_id: int
     ) -> tuple[BoolArray, Pixels]:
-        """Which features (N,) to look for, and where to start (N, 2)."""
+        """Which features (N,) to look for, and where to start (N, 2) in the scaled image."""
         guess = reference.pixels.copy()
         known = are_among(reference.ids, self._ids)
         rows = known.nonzero()[0]
@@ -298,13 +308,15 @@ class StereoMatcher:
         depth_m = ray_depths(self._search.R, self._search.t, m_reference, m_other)[:, 0]
         if self._wide:
             camera, other = self._reference, self._camera
-            distance_px = distances_px(camera, self._essential, m_reference, m_other, other)
+            distance_px = distances_px(camera, self._search.essential, m_reference, m_other, other)
             depth_m = depth_m * np.sqrt(1.0 + np.sum(m_reference**2, axis=1))  # along the ray
         else:
-            distance_px = epipolar_distance(self._essential, m_reference, m_other) * focal_px
+            distance = epipolar_distance(self._search.essential, m_reference, m_other)
+            distance_px = distance * focal_px
         # In terms of disparity, because far points may come out a little beyond infinity
-        disparity_px = focal_px * self._baseline_m / depth_m
-        nearest_px = focal_px * self._baseline_m / self._config.stereo_min_depth_m
+        baseline_m = float(np.linalg.norm(self._search.t))
+        disparity_px = focal_px * baseline_m / depth_m
+        nearest_px = focal_px * baseline_m / self._config.stereo_min_depth_m
         tolerance_px = self._config.stereo_epipolar_px
         good: BoolArray = distance_px < tolerance_px
         return good & (disparity_px < nearest_px) & (disparity_px > -tolerance_px)

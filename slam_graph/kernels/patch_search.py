@@ -113,13 +113,13 @@ def most_similar(
     Returns:
         (N,) their indices.
     """
-    height, width = other.shape
+    (height, width), (reference_height, reference_width) = other.shape, reference.shape
     best = np.empty(len(points), np.int64)
     pixels = (2 * radius + 1) ** 2
     patch, candidate = np.empty(pixels, np.int16), np.empty(pixels, np.int16)
     for n in range(len(points)):
-        u = _centre(points[n, 0], scale, width, radius)
-        v = _centre(points[n, 1], scale, height, radius)
+        u = _centre(points[n, 0], scale, reference_width, radius)
+        v = _centre(points[n, 1], scale, reference_height, radius)
         _copy(reference, u, v, radius, patch)
         sum_r, sum_rr = np.int64(0), np.int64(0)
         for k in range(len(patch)):

@@ -359,7 +359,7 @@ def track_windows(
     Args:
         source: (height, width) the one image.
         source_halvings: its halvings one behind another, at least `levels` of them.
-        target: the other image, of the same size.
+        target: the other image, of any size.
         target_halvings: those of the other image.
         points: (N, 2) pixels in `source`.
         start: (N, 2) where to begin in `target`.

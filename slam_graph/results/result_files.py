@@ -33,11 +33,12 @@ def refuse_to_replace(path: Path, force: bool) -> None:
     """Make sure that no file is overwritten unless that is asked for.
 
     Raises:
-        DataError: if the path exists without `force`, or is a folder.
+        DataError: if the file exists without `force`, or is a folder. A device or a pipe is
+            written to, and not replaced.
     """
     if path.is_dir():
         raise DataError(f"{path}: is a folder; name a file")
-    if path.exists() and not force:
+    if path.is_file() and not force:
         raise DataError(f"{path}: exists already; choose another name, or replace it by --force")
 
 

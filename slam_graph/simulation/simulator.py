@@ -108,6 +108,22 @@ def simulate(
         DataError: if a recorded trajectory or calibration is missing or cannot be used.
     """
     config = load_simulation_config(config, overrides, **settings)
+    _refuse_contradictions(config)
+    diagnostics = diagnostics if diagnostics is not None else Diagnostics()
+    flight = _flight(config, diagnostics)
+    source = config.trajectory if config.recorded is None else _name(config.recorded)
+    name = f"{source}_{config.kind}_{config.seed}"
+    if config.kind == "images":
+        return SimulatedImages(name, config, flight, diagnostics)
+    return SimulatedTracks(name, config, flight, _landmarks(config, flight), diagnostics)
+
+
+def _refuse_contradictions(config: SimulationConfig) -> None:
+    """Refuse settings that contradict one another.
+
+    Raises:
+        ConfigError: if some do.
+    """
     if config.recorded is None and (config.real_imu or config.start_s > 0):
         raise ConfigError(
             "real_imu and start_s are for recorded trajectories, "
@@ -121,13 +137,11 @@ def simulate(
         raise ConfigError("trajectory 'car' has tracks only; remove kind, or choose another one")
     if config.real_imu and not config.with_imu:
         raise ConfigError("real_imu is for recordings with an IMU; remove it, or set with_imu")
-    diagnostics = diagnostics if diagnostics is not None else Diagnostics()
-    flight = _flight(config, diagnostics)
-    source = config.trajectory if config.recorded is None else _name(config.recorded)
-    name = f"{source}_{config.kind}_{config.seed}"
-    if config.kind == "images":
-        return SimulatedImages(name, config, flight, diagnostics)
-    return SimulatedTracks(name, config, flight, _landmarks(config, flight), diagnostics)
+    if config.gnss.multipath > 0.0 and config.gnss.sigma_m is None:
+        raise ConfigError(
+            "gnss.multipath (--multipath) is a share of position fixes, and there are none: give "
+            "their sigma, gnss.sigma_m (--gnss)"
+        )
 
 
 def euroc_rig() -> Rig:
