@@ -4,6 +4,7 @@
 
 from typing import Any
 
+import gtsam
 import numpy as np
 import pytest
 from groups import slow, slow_but
@@ -15,9 +16,11 @@ from slam_graph.backend.initialization.start_calibration import FoundCalibration
 from slam_graph.datasets.faults.injection import inject
 from slam_graph.datasets.sequence import RecordedSequence
 from slam_graph.evaluation import ape
-from slam_graph.geometry import Trajectory
+from slam_graph.frontend.prediction import ImuMotion
+from slam_graph.geometry import NavState, Trajectory
+from slam_graph.pipeline.stage import EstimatedFrame
 from slam_graph.results import RunResult
-from slam_graph.sensors import FeatureFrame, ImuBuffer, ImuData
+from slam_graph.sensors import FeatureFrame, ImuBuffer, ImuData, ImuNoise, Packet
 
 CHANGED_S = 9.0
 NONE = np.zeros(0, np.int64)
@@ -123,6 +126,30 @@ def test_a_clock_that_was_corrected_at_the_start_may_change() -> None:
     kinds = [type(what) for _, what in found_in(late)]
     assert kinds[0] is FoundCalibration
     assert ClockChange in kinds[1:]
+
+
+@pytest.mark.parametrize("shift_s", [0.0, 0.1, -0.1])
+def test_the_front_end_predicts_alike_on_any_clock(shift_s: float) -> None:
+    """Its samples are on the new one, the state is on that of the beginning."""
+    stamps = np.arange(0, 2_000_000_001, 5_000_000) + round(shift_s * 1e9)
+    turns = np.tile([0.0, 0.0, 0.5], (len(stamps), 1))
+    imu = ImuData(stamps, turns, np.tile([0.0, 0.0, 9.81], (len(stamps), 1)))
+    zero, change = np.zeros(3), ClockChange(0, 0, 0, shift_s, 0.001)
+    state = NavState(
+        1_000_000_000, gtsam.Pose3(), np.array([1.0, 0, 0]), accel_bias=zero, gyro_bias=zero
+    )
+    features = FeatureFrame(state.stamp_ns, ())
+    told = EstimatedFrame(
+        *(Packet(imu, features), features, state, NONE, np.zeros((0, 3)), NONE, (1.0, 1.0), True),
+        clock_changes=sg.Estimator.ClockChanges((change,)),
+    ).feedback()
+    motion = ImuMotion(ImuNoise(), 9.81)
+    motion.add(imu)
+    motion.state = told.state
+    pose = motion.pose(state.stamp_ns + 100_000_000 + round(shift_s * 1e9))
+    assert pose is not None
+    assert pose.translation() == pytest.approx([0.1, 0.0, 0.0], abs=1e-6)
+    assert pose.rotation().yaw() == pytest.approx(0.05)
 
 
 def test_samples_are_put_on_the_old_clock() -> None:

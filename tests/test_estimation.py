@@ -9,11 +9,16 @@ from typing import Any
 import gtsam
 import numpy as np
 import pytest
+from map_flights import World
 
 import slam_graph as sg
 from slam_graph.arrays import FloatArray
-from slam_graph.backend import Estimator
+from slam_graph.backend import Estimator, MovingObjects
+from slam_graph.backend.aiding.world_alignment import WorldAlignment
 from slam_graph.backend.initialization.clock_change import ClockChange
+from slam_graph.backend.objects.object_frame import ObjectDirection
+from slam_graph.backend.objects.object_state import ObjectState
+from slam_graph.backend.world_gauge import in_moved_world
 from slam_graph.config import load_config
 from slam_graph.datasets.faults.injection import inject
 from slam_graph.diagnostics import Diagnostics
@@ -22,6 +27,7 @@ from slam_graph.pipeline.divergence import DivergenceError
 from slam_graph.pipeline.recovery import Recovery
 from slam_graph.pipeline.stage import EstimatedFrame
 from slam_graph.results import RunInput, RunResult
+from slam_graph.results.localization_result import LocalizationLog
 from slam_graph.sensors import FeatureFrame, ImuData
 
 CAUSAL = ["final_ba.enabled=false", "backend.initialization.mode=given"]
@@ -220,3 +226,67 @@ def test_a_time_without_frames_and_samples_is_refused(
     estimator.add_imu(samples(11.2, 11.5))
     with pytest.raises(DivergenceError, match=r"nothing was recorded for 1\.2 s"):
         check.check_recorded(11 * SECOND_NS + SECOND_NS // 2)
+
+
+# --- what rests on states ------------------------------------------------------------------------
+
+
+def state_at(stamp_s: float) -> NavState:
+    """A state somewhere."""
+    pose = gtsam.Pose3(gtsam.Rot3.Rz(stamp_s), np.array([stamp_s, 1.0, 2.0]))
+    known = {"accel_bias": np.zeros(3), "gyro_bias": np.zeros(3), "covariance": np.eye(15)}
+    return NavState(round(stamp_s * SECOND_NS), pose, np.zeros(3), **known)
+
+
+def with_objects(check: Recovery, stamps_s: list[float]) -> tuple[MovingObjects, LocalizationLog]:
+    """An object, a direction, and a pose in a map at some times of a run, all where it is."""
+    result = check._result
+    config = result.config
+    settings = config.object_policies, config.backend, config.objects
+    objects = result.objects = MovingObjects(result.rig, *settings, {})
+    log = result.begin_localization(World().map())
+    for stamp_s in stamps_s:
+        stamp_ns, pose = round(stamp_s * SECOND_NS), state_at(stamp_s).world_T_body
+        known = pose, np.eye(6), pose, None, np.zeros(3), np.eye(3), True, 20
+        objects.note([ObjectState(stamp_ns, 1, 0, *known)], ())
+        objects.directions.append(ObjectDirection(stamp_ns, 2, *np.eye(3)[:2], 0.1, 0.1, 5))
+        log.append(stamp_ns, True, pose, 0.1)
+    return objects, log
+
+
+def test_what_rests_on_states_that_are_taken_back_goes_with_them(
+    recovery: tuple[Recovery, Estimator],
+) -> None:
+    check, _ = recovery
+    objects, log = with_objects(check, [9.0, 10.0, 10.5])
+    check._result.forget_states(10 * SECOND_NS)
+    assert [state.stamp_ns for state in objects.states(1)] == [9 * SECOND_NS]
+    assert [seen.stamp_ns for seen in objects.directions] == [9 * SECOND_NS]
+    assert log.located.tolist() == [True, False, False]
+    assert log.trajectory().stamps_ns.tolist() == [9 * SECOND_NS]
+    check._result.forget_states(None)
+    assert objects.numbers == []
+    assert not log.located.any()
+    objects.begin(check._result.rig)
+    assert objects._tracker._next == 3, "a number means one object for good"
+
+
+@pytest.mark.parametrize("rigid", [True, False])
+def test_what_rests_on_states_that_move_with_their_world_stays(
+    recovery: tuple[Recovery, Estimator], rigid: bool
+) -> None:
+    """To that of the fixes; states that come back otherwise are other ones."""
+    check, estimator = recovery
+    before = [state_at(10.0), state_at(10.1)]
+    check._recent.clear()
+    check.append(before)
+    objects, log = with_objects(check, [10.0, 10.1])
+    motion = gtsam.Pose3(gtsam.Rot3.Rz(1.0), np.array([100.0, -50.0, 2.0]))
+    found = WorldAlignment(motion, np.eye(4), np.zeros(3), np.ones(0, np.bool_))
+    estimator.aiding.found = found
+    after = in_moved_world(before, motion)
+    after[0] = after[0] if rigid else before[0]
+    check.supersede(after)
+    assert (check.world_motion is not None) == rigid
+    assert log.located.all() == rigid
+    assert (objects.numbers == [1]) == rigid

@@ -9,11 +9,16 @@ from gtsam.symbol_shorthand import L, V, X
 
 import slam_graph as sg
 from slam_graph.arrays import FloatArray
+from slam_graph.backend import MovingObjects
 from slam_graph.backend.aiding.aiding_factors import Aiding
 from slam_graph.backend.aiding.regauging import left_of_gauge, moved_by_gauge
+from slam_graph.backend.aiding.world_alignment import WorldAlignment
+from slam_graph.backend.objects.object_frame import ObjectDirection
+from slam_graph.backend.objects.object_history import ObjectHistory
+from slam_graph.backend.objects.object_state import ObjectState
 from slam_graph.backend.solve.square_root import SquareRootInformation
 from slam_graph.backend.window import Window
-from slam_graph.backend.world_gauge import in_moved_world
+from slam_graph.backend.world_gauge import in_moved_world, with_unknown_gauge
 from slam_graph.geometry import NavState
 
 
@@ -79,6 +84,84 @@ def test_the_posterior_knows_that_the_world_was_moved(window: Window) -> None:
     np.testing.assert_allclose(back, -g, rtol=0.02, atol=1e-5)
     again, rest, _ = moved_by_gauge(there, moved, back)
     assert left_of_gauge(again, rest, level=True) is None
+
+
+@pytest.mark.parametrize("size", [4, 6])
+def test_an_object_moves_with_the_platform_to_the_world_of_fixes(size: int) -> None:
+    """One that is where the platform is becomes what the platform becomes; what was before stays.
+
+    A direction stays where it is before the platform.
+    """
+    rng = np.random.default_rng(size)
+    motion, spread = gtsam.Pose3.Expmap(rng.normal(size=6)), rng.normal(size=(size, size))
+    if size == 4:
+        motion = gtsam.Pose3(gtsam.Rot3.Rz(2.0), motion.translation())
+    found = WorldAlignment(motion, spread @ spread.T, rng.normal(size=3), np.ones(0, np.bool_))
+    pose, velocity, zero = gtsam.Pose3.Expmap(rng.normal(size=6)), rng.normal(size=3), np.zeros(3)
+    P = np.diag(rng.uniform(0.1, 1.0, 15))
+    state = NavState(5, pose, velocity, accel_bias=zero, gyro_bias=zero, covariance=P)
+    known = pose, P[:6, :6], pose, None, velocity, P[6:9, 6:9], True, 20
+    objects, sight = ObjectHistory({}), pose.rotation().rotate([1.0, 0.0, 0.0])
+    objects.note([ObjectState(stamp_ns, 1, 0, *known) for stamp_ns in (4, 5)], ())
+    objects.directions = [ObjectDirection(5, 2, sight, sight, 0.1, 0.1, 5)]
+    objects.settle(found, 5)
+    there = with_unknown_gauge(
+        in_moved_world([state], found.motion)[0], found.covariance, found.centre
+    )
+    before, moved = objects.states(1)
+    assert before.world_T_object.equals(pose, 0.0)
+    assert moved.world_T_object.equals(there.world_T_body, 1e-9)
+    assert moved.world_T_body.equals(there.world_T_body, 1e-9)
+    assert there.covariance is not None
+    np.testing.assert_allclose(moved.covariance, there.covariance[:6, :6], atol=1e-9)
+    np.testing.assert_allclose(moved.velocity, there.velocity, atol=1e-9)
+    (seen,) = objects.directions
+    ahead = there.world_T_body.rotation().unrotate(seen.direction)
+    np.testing.assert_allclose(ahead, [1.0, 0.0, 0.0], atol=1e-9)
+    np.testing.assert_allclose(seen.rate, seen.direction, atol=1e-9)
+
+
+def test_objects_and_map_of_a_run_are_in_the_world_of_its_fixes() -> None:
+    """From the beginning: also what was seen before that world was known."""
+    sequence = sg.simulate(
+        duration_s=4.5,
+        rate_hz=10.0,
+        seed=0,
+        tracks={"features": 60, "pixel_sigma": 0.5, "descriptors": True},
+        objects={"count": 1},
+        gnss={"sigma_m": 0.05, "rate_hz": 5.0},
+    )
+    wanted = ("objects.enabled=true", "map.enabled=true", "final_ba.enabled=false")
+    run = sg.run(sequence, overrides=[*wanted, "backend.noise.pixel_sigma=0.5"])
+    assert run.georeferenced
+    assert run.objects is not None
+    assert run.slam_map is not None
+    offset_ns, first_ns = round(sequence.rig.pose_offset_s * 1e9), run.trajectory.stamps_ns[0]
+    states, keyframes = run.objects.all_states(), run.slam_map
+    assert states[0].stamp_ns + offset_ns < first_ns + 1_000_000_000
+    assert keyframes.stamps_ns[0] == first_ns
+    seen = [(s.stamp_ns + offset_ns, s.world_T_body.translation()) for s in states]
+    seen += list(zip(keyframes.stamps_ns.tolist(), keyframes.poses.translations, strict=True))
+    at = dict(zip(run.trajectory.stamps_ns.tolist(), run.trajectory.positions, strict=True))
+    np.testing.assert_allclose([p for _, p in seen], [at[stamp] for stamp, _ in seen], atol=1e-6)
+
+
+def test_frames_of_the_platform_move_with_its_world() -> None:
+    """Once, where fixes move it again: what is at rest is not seen to move by that."""
+    rng, told = np.random.default_rng(1), sg.load_config()
+    settings = told.object_policies, told.backend, told.objects
+    objects = MovingObjects(sg.simulate(duration_s=1.0).rig, *settings, {})
+    poses = {k: gtsam.Pose3.Expmap(rng.normal(size=6)) for k in range(3)}
+    objects._window._poses = dict(poses)
+    objects._window._velocities = {k: pose.rotation().matrix()[0] for k, pose in poses.items()}
+    estimator = sg.Estimator(sg.simulate(duration_s=1.0).rig, told.algorithm, told.backend)
+    estimator.aiding.moved = motion = gtsam.Pose3.Expmap(rng.normal(size=6))
+    for _ in range(2):
+        objects._move(estimator)
+        for k, pose in objects._window._poses.items():
+            assert pose.equals(motion.compose(poses[k]), 1e-9)
+            turned = motion.rotation().rotate(poses[k].rotation().matrix()[0])
+            np.testing.assert_allclose(objects._window._velocities[k], turned)
 
 
 def test_fixes_turn_the_world_of_an_algorithm_with_damped_steps(

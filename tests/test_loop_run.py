@@ -3,18 +3,27 @@
 """Runs with loop closure, from the command line to the files."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
+import gtsam
 import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from slam_graph.backend.world_gauge import in_moved_world
 from slam_graph.cli.main import app
 from slam_graph.config import load_config
+from slam_graph.diagnostics import Diagnostics
+from slam_graph.geometry import NavState, interpolate
+from slam_graph.pipeline.mapping import Keyframes, MapBuilding
 from slam_graph.pipeline.run_recording import run
+from slam_graph.pipeline.stage import EstimatedFrame
+from slam_graph.results.run_input import RunInput
 from slam_graph.results.run_result import RunResult
 from slam_graph.results.saved_run import SavedRun, load_result
+from slam_graph.sensors import CalibrationEstimate, FeatureFrame, Rig
 from slam_graph.simulation.simulation_config import LandmarkConfig, SimulationConfig, TrackConfig
 from slam_graph.simulation.simulator import simulate
 
@@ -160,3 +169,72 @@ def test_what_goes_wrong_leaves_the_causal_result(monkeypatch: pytest.MonkeyPatc
         assert len(result.trajectory) > 10
         assert result.loops is None
         assert result.warnings["loop_closure_failed"] >= 1
+
+
+# --- keyframes of a run that begins anew, or whose calibration is estimated ----------------------
+
+
+def begun(rig: Rig | None = None) -> tuple[RunResult, Keyframes, list[EstimatedFrame]]:
+    """A short run with another calibration, and its frames with the true states."""
+    tracks = TrackConfig(features=40, descriptors=True)
+    sequence = simulate(SimulationConfig(duration_s=2.0, rate_hz=10.0, cameras=2, tracks=tracks))
+    rig, info = rig or sequence.rig, sequence.info()
+    config = load_config(None, ["loop_closure.keyframes.distance_m=0.1"])
+    result = RunResult(RunInput(info, config, rig, info.start_ns, info.end_ns))
+    offset_ns, frames = round(sequence.rig.pose_offset_s * 1e9), []
+    none, zero = np.zeros(0, np.int64), np.zeros(3)
+    for packet in sequence.packets():
+        seen = packet.frame
+        assert isinstance(seen, FeatureFrame)
+        stamp_ns = seen.stamp_ns + offset_ns
+        near, valid = interpolate(sequence.groundtruth(), np.array([stamp_ns]))
+        if valid[0]:
+            state = NavState(stamp_ns, near.pose(0), zero, accel_bias=zero, gyro_bias=zero)
+            told = none, np.zeros((0, 3)), none, (1.0, 1.0), True
+            frames.append(EstimatedFrame(packet, seen, state, *told))
+    return result, Keyframes(result), frames
+
+
+@pytest.mark.parametrize("rigid", [True, False])
+def test_keyframes_move_with_the_states_to_another_world(rigid: bool) -> None:
+    """As to that of position fixes; where the states are others, keyframes begin anew."""
+    motion = gtsam.Pose3(gtsam.Rot3.Rz(1.0), np.array([100.0, -50.0, 2.0]))
+    (_, never, frames), (_, stage, _) = begun(), begun()
+    for k, frame in enumerate(frames):
+        never.frame(frame)
+        assert frame.state is not None
+        if k >= 10:
+            frame = replace(
+                frame,
+                state=in_moved_world([frame.state], motion)[0],
+                restarted=k == 10,
+                world_motion=motion if rigid and k == 10 else None,
+            )
+        stage.frame(frame)
+    if not rigid:
+        assert frames[10].state is not None
+        assert stage.found[0].stamp_ns == frames[10].state.stamp_ns
+        return
+    assert len(stage.found) == len(never.found) > 2
+    for here, there in zip(never.found, stage.found, strict=True):
+        assert there.stamp_ns == here.stamp_ns
+        assert there.world_T_body.equals(motion.compose(here.world_T_body), 1e-9)
+        np.testing.assert_allclose(there.points, here.points, atol=1e-6)
+
+
+def test_keyframes_and_map_have_the_calibration_that_is_estimated() -> None:
+    result, right, frames = begun()
+    true = result.rig
+    turned = true.cameras[1].body_T_camera.compose(gtsam.Pose3(gtsam.Rot3.Ry(0.03), np.zeros(3)))
+    second = replace(true.cameras[1], body_T_camera=turned)
+    wrong = replace(true, cameras=(true.cameras[0], second))
+    result, stage, _ = begun(wrong)
+    result.logs.calibration.append(CalibrationEstimate(0, wrong, true, {}))
+    for frame in frames:
+        right.frame(frame)
+        stage.frame(frame)
+    for ours, expected in zip(stage.found, right.found, strict=True):
+        np.testing.assert_array_equal(ours.points, expected.points)
+    MapBuilding(result, stage, Diagnostics()).finish()
+    assert result.slam_map is not None
+    assert result.slam_map.recordings[0].rig is true

@@ -103,11 +103,17 @@ def localizer(world: World, **changes: float) -> MapLocalizer:
 ODOM_T_MAP = gtsam.Pose3(gtsam.Rot3.Rz(2.0), np.array([30.0, -7.0, 4.0]))
 
 
-def fly(world: World, located: MapLocalizer, number: int, steps: range) -> list[float]:
+def fly(
+    world: World,
+    located: MapLocalizer,
+    number: int,
+    steps: range,
+    odom_T_map: gtsam.Pose3 = ODOM_T_MAP,
+) -> list[float]:
     """Errors of positions along a path; the world of the run is another than the map's."""
     errors = []
     for step in steps:
-        pose = ODOM_T_MAP.compose(world.pose(number + step))
+        pose = odom_T_map.compose(world.pose(number + step))
         view = world.view(number + step, pose)
         located.move(view.stamp_ns, pose)
         if located.wants(view.stamp_ns):
@@ -140,6 +146,28 @@ def test_the_calibration_of_the_map_does_not_matter(world: World) -> None:
         poses.append(match.world_T_body)
     assert poses[0].equals(poses[1], 1e-12)
     assert poses[0].equals(world.pose(2), 1e-3)
+
+
+def test_a_run_without_an_imu_is_located_however_its_world_is_tilted(world: World) -> None:
+    """Its roll and pitch mean nothing, also where those of the map do."""
+    known, rig = replace(world.map(), gravity_aligned=True), world.rig.without_imu()
+    config = CONFIG.model_copy(update={"period_s": 0.0})
+    located = MapLocalizer(known, rig, LoopClosureConfig(), config)
+    tilted = gtsam.Pose3(gtsam.Rot3.Rx(1.6), np.array([30.0, -7.0, 4.0]))
+    assert max(fly(world, located, 0, range(5), tilted)) < 0.05
+    assert located.starts == 1
+
+
+def test_a_run_that_begins_anew_is_located_in_the_index_that_is_there(world: World) -> None:
+    located = localizer(world)
+    fly(world, located, 0, range(4))
+    places = located.places
+    located.restart(world.rig)
+    assert located.places is places
+    assert located.filter is None
+    assert located.queries == 4, "all are counted"
+    assert max(fly(world, located, 1, range(4))) < 0.05
+    assert located.starts == 2
 
 
 def test_a_false_match_is_left_out(world: World, monkeypatch: pytest.MonkeyPatch) -> None:

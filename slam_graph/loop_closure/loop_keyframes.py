@@ -49,6 +49,12 @@ class View:
     rotation: FloatArray
     position: FloatArray
 
+    def moved(self, motion: gtsam.Pose3) -> View:
+        """The same in a world that is moved by `new_T_old`."""
+        R = motion.rotation().matrix()
+        position = R @ self.position + motion.translation()
+        return View(self.frame, R @ self.rotation, position)
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Keyframe:
@@ -73,6 +79,11 @@ class Keyframe:
     descriptors: Descriptors
     points: FloatArray
     views: tuple[View, ...] = ()
+
+    def moved(self, motion: gtsam.Pose3) -> Keyframe:
+        """The same in a world that is moved by `new_T_old`."""
+        views = tuple(view.moved(motion) for view in self.views)
+        return replace(self, world_T_body=motion.compose(self.world_T_body), views=views)
 
     def world_points(self, world_T_body: gtsam.Pose3 | None = None) -> tuple[IntArray, FloatArray]:
         """Ids (M,) and world positions (M, 3) of the known points, from this pose or another."""
@@ -141,6 +152,7 @@ class KeyframeLog:
 
     Attributes:
         keyframes: so far.
+        rig: the cameras, as they are known now.
     """
 
     Describer: TypeAlias = KeyframeDescriber
@@ -148,7 +160,7 @@ class KeyframeLog:
     def __init__(self, rig: Rig, config: KeyframeConfig) -> None:
         self.keyframes: list[Keyframe] = []
         self._config = config
-        self._rig = rig
+        self.rig = rig
         camera = rig.cameras[0].camera
         self._describer = KeyframeDescriber(camera, config.further_corners)
         self._focal_px = float(np.sqrt(camera.fx * camera.fy))
@@ -185,10 +197,18 @@ class KeyframeLog:
             seen.normalized,
             seen.descriptors,
             self._points(seen.ids, views, world_T_body),
-            () if self._rig.has_scale else views,
+            () if self.rig.has_scale else views,
         )
         self.keyframes.append(keyframe)
         return keyframe
+
+    def move(self, motion: gtsam.Pose3, after_ns: int | None = None) -> None:
+        """Go on in a world that is moved by `new_T_old`, with the keyframes after a time."""
+        self.keyframes = [
+            k.moved(motion) if after_ns is None or k.stamp_ns > after_ns else k
+            for k in self.keyframes
+        ]
+        self._recent = deque((view.moved(motion) for view in self._recent), maxlen=POINT_FRAMES)
 
     def at(self, trajectory: Trajectory) -> list[Keyframe]:
         """The keyframes at the poses of a trajectory; those outside of it keep their poses.
@@ -243,7 +263,7 @@ class KeyframeLog:
             [view.frame for view in views],
             np.array([view.rotation for view in views]),
             np.array([view.position for view in views]),
-            self._rig,
+            self.rig,
         )
         good = found.good & (found.reprojection_px < MAX_REPROJECTION_PX)
         good &= found.depth_error < MAX_DEPTH_ERROR * self._focal_px

@@ -194,10 +194,15 @@ class MapLocalizer:
         self, content: SlamMap, rig: Rig, loops: LoopClosureConfig, config: LocalizationConfig
     ) -> None:
         self.places = MapPlaces(content, rig, loops, config.neighbours)
-        self.filter: MapPoseFilter | None = None
         self.queries = self.matches = self.accepted = self.starts = 0
         self._config = config
-        self._level = content.gravity_aligned
+        self.restart(rig)
+
+    def restart(self, rig: Rig) -> None:
+        """Begin anew with a run that has begun anew, perhaps with another calibration."""
+        self.places.use(rig)
+        self.filter: MapPoseFilter | None = None
+        self._level = self.places.map.gravity_aligned and rig.has_imu
         self._pending: list[_Measurement] = []
         self._rejected = 0
         self._queried_ns: int | None = None

@@ -62,10 +62,15 @@ class MapPlaces:
     ) -> None:
         self.map = content
         self._neighbours = neighbours
-        self._verifier = LoopVerifier(rig.cameras[0], config.verification)
+        self._config = config.verification
+        self.use(rig)
         self._database = content.vocabulary.index(map(content.descriptors_of, range(len(content))))
         self._shared = content.seen_by.minimum(1)
         self._places: dict[int, Keyframe] = {}
+
+    def use(self, rig: Rig) -> None:
+        """Match views of a rig with another calibration from now on."""
+        self._verifier = LoopVerifier(rig.cameras[0], self._config)
 
     def check(self, descriptors: NDArray[np.uint8], name: str) -> None:
         """Check that descriptors are of the kind of the map.

@@ -187,6 +187,7 @@ class Estimation:
             initialized=estimator.initialized,
             corrected_rig=estimator.corrected_rig,
             restarted=estimator.replayed is not None or lost,
+            world_motion=self._recovery.world_motion,
             waits=not lost and estimator.solved_ns != features.stamp_ns,
             milliseconds=tracked.clock.milliseconds,
             counts=tracked.frame_stats,
@@ -243,8 +244,9 @@ class Estimation:
                 clock of the IMU has changed.
         """
         estimator, result = self.estimator, self._result
+        self._recovery.world_motion = None
         if estimator.replayed is not None:
-            self._recovery.supersede([])
+            self._recovery.supersede(estimator.replayed)
             self._note_calibration()
             if not len(result.segments):
                 result.start_was_given &= estimator.start_is_given

@@ -13,6 +13,7 @@ import time
 from dataclasses import replace
 
 import cv2
+import gtsam
 import numpy as np
 
 from slam_graph.datasets import Sequence
@@ -24,7 +25,7 @@ from slam_graph.maps import MapLocalizer, MapRecording, SlamMap, build_map
 from slam_graph.pipeline.stage import COMPLETED, EstimatedFrame, Stage, warn_on_failure
 from slam_graph.pose_graph import Poses
 from slam_graph.results import RunInput, RunResult
-from slam_graph.sensors import FeatureFrame
+from slam_graph.sensors import FeatureFrame, Rig
 
 NOT_RECOGNISABLE = "nothing to recognise places by: no images, and tracks without descriptors"
 
@@ -65,6 +66,11 @@ def require_places(sequence: Sequence, asked: RunInput, known_map: SlamMap | Non
         raise DataError(f"{asked.info.name}: cannot {purpose}, {NOT_RECOGNISABLE}; {_REMEDY}")
 
 
+def _rig_of(result: RunResult) -> Rig:
+    """The best calibration available."""
+    return result.logs.calibration.rig(result.causal_rig)
+
+
 class Keyframes(Stage):
     """Collects the keyframes that loop closure and map need, with their descriptors.
 
@@ -83,23 +89,29 @@ class Keyframes(Stage):
     def frame(self, frame: EstimatedFrame) -> None:
         """Take a frame, if there is an estimate."""
         if frame.restarted:
-            self._restart()
+            self._restart(frame.world_motion)
         state = frame.state
         if state is None or frame.waits:
             return
         began = time.perf_counter()
         # the state's time is on the IMU's clock, also where the camera's time offset is estimated
         features = FeatureFrame(state.stamp_ns, frame.features.cameras)
+        self._log.rig = _rig_of(self._result)
         self._log.add(features, state.world_T_body, frame.image)
         self.seconds += time.perf_counter() - began
 
-    def _restart(self) -> None:
-        """Keep the keyframes of segments that have ended, and forget those after them."""
-        result, earlier = self._result, self._log.keyframes
-        ended = [segment for segment in result.segments if segment.ended_by]
+    def _restart(self, motion: gtsam.Pose3 | None) -> None:
+        """Keep the keyframes of segments that have ended, and forget those after them.
+
+        Args:
+            motion: new_T_old of the worlds, if those after them have moved instead.
+        """
+        result, earlier, good_ns = self._result, self._log.keyframes, self._result.segments.ended_ns
+        if motion is not None:
+            self._log.move(motion, good_ns)
+            return
         self._log = KeyframeLog(result.causal_rig, result.config.loop_closure.keyframes)
-        if ended:
-            good_ns = ended[-1].end_ns
+        if good_ns is not None:
             self._log.keyframes += [k for k in earlier if k.stamp_ns <= good_ns]
 
     @property
@@ -136,7 +148,7 @@ class LoopClosing(Stage):
         with warn_on_failure(self._diagnostics, "loop_closure_failed", "no loops are closed"):
             closures = close_loops(
                 self._keyframes.at(result.best_trajectory),
-                result.causal_rig,
+                _rig_of(result),
                 result.config.loop_closure,
                 result.config.seed,
                 self._diagnostics,
@@ -192,7 +204,7 @@ def _build(result: RunResult, keyframes: Keyframes) -> SlamMap:
     causal ones.
     """
     config, loops = result.config, _accepted_loops(result)
-    recording = MapRecording(result.input.info.name, "causal", result.causal_rig)
+    recording = MapRecording(result.input.info.name, "causal", _rig_of(result))
     if loops and result.loops is not None:
         recording, poses = replace(recording, poses="loop_closed"), result.loops.poses
     elif result.final_ba is not None:
@@ -225,18 +237,13 @@ class Localization(Stage):
     """
 
     def __init__(self, result: RunResult, known: SlamMap, diagnostics: Diagnostics) -> None:
-        loops, self._result, self._known = result.config.loop_closure, result, known
+        loops, self._result = result.config.loop_closure, result
         camera = result.input.rig.cameras[0].camera
         self._describer = KeyframeLog.Describer(camera, loops.keyframes.further_corners)
-        self._localizer = self._new_localizer()
+        config, rig = result.config.localization, result.causal_rig
+        self._localizer = MapLocalizer(known, rig, loops, config)
         self._name, self._diagnostics = result.input.info.name, diagnostics
         self._log = result.begin_localization(known)
-
-    def _new_localizer(self) -> MapLocalizer:
-        config = self._result.config
-        return MapLocalizer(
-            self._known, self._result.causal_rig, config.loop_closure, config.localization
-        )
 
     def frame(self, frame: EstimatedFrame) -> None:
         """Take a frame, if there is an estimate.
@@ -245,8 +252,7 @@ class Localization(Stage):
             DataError: if the run has descriptors of another kind than the map.
         """
         if frame.restarted:
-            self._count()
-            self._localizer = self._new_localizer()
+            self._localizer.restart(self._result.causal_rig)
         state = frame.state
         if state is None or frame.waits:
             return
@@ -286,15 +292,11 @@ class Localization(Stage):
             unknown,
         )
 
-    def _count(self) -> None:
-        """Count the comparisons with the map."""
-        names = ("queries", "matches", "accepted", "starts")
-        self._log.count(**{name: getattr(self._localizer, name) for name in names})
-
     def finish(self) -> None:
         """Count the comparisons, and say how much was located."""
-        self._count()
         log = self._log
+        names = ("queries", "matches", "accepted", "starts")
+        log.count(**{name: getattr(self._localizer, name) for name in names})
         if len(log.located) and log.counts["queries"] == 0:
             self._diagnostics.warn(
                 "localization_impossible",

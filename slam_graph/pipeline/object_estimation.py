@@ -91,7 +91,7 @@ class Objects(NoObjects):
             frame = replace(frame, features=self._labels.labelled(frame.features))
         features = frame.features.whole
         if frame.restarted:
-            self._objects.begin(self._result.causal_rig)
+            self._begin_again(frame)
         if frame.state is not None and not frame.waits:
             with warn_on_failure(
                 self._diagnostics, "objects_failed", "a frame without moving objects"
@@ -101,14 +101,22 @@ class Objects(NoObjects):
         self.moved = np.union1d(self.moved, self.found.moving)
         return replace(frame, objects=self.found)
 
+    def _begin_again(self, frame: EstimatedFrame) -> None:
+        """Begin without objects; those so far move if the platform's states have moved."""
+        found, ended_ns = self._estimator.aiding.found, self._result.segments.ended_ns
+        if frame.world_motion is not None and found is not None:
+            self._objects.settle(
+                found, np.iinfo(np.int64).min if ended_ns is None else ended_ns + 1
+            )
+        self._objects.begin(self._result.causal_rig)
+
     def finish(self) -> None:
         """Smooth the objects, and say so if no mask belongs to any frame."""
         result = self._result
         if result.final_ba is not None:
             with warn_on_failure(self._diagnostics, "objects_failed", _NOT_SMOOTHED):
                 self._recording.close()
-                calibrated = result.logs.calibration.latest
-                rig = result.causal_rig if calibrated is None else calibrated.rig
+                rig = result.logs.calibration.rig(result.causal_rig)
                 task = self._objects, rig, result.final_ba, result.config.final_ba
                 result.final_ba, failures = self._smoother.smooth(*task)
                 for failure in failures:

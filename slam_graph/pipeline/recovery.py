@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections import deque
 from itertools import pairwise
 
+import gtsam
 import numpy as np
 
 from slam_graph.backend import Estimator
@@ -28,6 +29,8 @@ _REMEMBERED_NS = 30_000_000_000
 _MARGIN_NS = 500_000_000
 """States so long before a contradiction are taken back too: it shows late, as new features are
 tested only after some frames."""
+_SAME = 1e-6
+"""States differ by no more than this, m and rad, if they differ by a motion of the world alone."""
 _LONGEST_BLIND_S = 1.0
 """Longest time without frames and without IMU samples after which an estimate goes on."""
 
@@ -39,6 +42,10 @@ class Recovery:
         result: of the run; it is given the states and the segments.
         estimator: the back end.
         diagnostics: counts new segments.
+
+    Attributes:
+        world_motion: new_T_old, if the last frame has moved all states of the segment with their
+            world.
     """
 
     def __init__(self, result: RunResult, estimator: Estimator, diagnostics: Diagnostics) -> None:
@@ -46,6 +53,7 @@ class Recovery:
         self._agreement = Agreement(result.config)
         self._recent: deque[NavState] = deque()
         self._short = 0
+        self.world_motion: gtsam.Pose3 | None = None
 
     @property
     def agreement(self) -> Agreement:
@@ -71,15 +79,32 @@ class Recovery:
             while self._recent[0].stamp_ns < state.stamp_ns - _REMEMBERED_NS:
                 self._recent.popleft()
 
-    def supersede(self, states: list[NavState]) -> None:
-        """Put other states in the place of those of the present segment."""
+    def supersede(self, by: list[NavState]) -> None:
+        """Forget the states of the present segment, as others come in their place.
+
+        Args:
+            by: those; they are still to be appended.
+        """
         segments = self._result.segments
         segments.forget_last()
         since_ns = segments[-1].end_ns + 1 if len(segments) else None
-        self._result.forget_states(since_ns)
+        self.world_motion = self._motion_to(by, since_ns)
+        self._result.forget_states(since_ns, self.world_motion is not None)
         self._agreement = Agreement(self._result.config)
         self._recent = deque(s for s in self._recent if since_ns and s.stamp_ns < since_ns)
-        self.append(states)
+
+    def _motion_to(self, by: list[NavState], since_ns: int | None) -> gtsam.Pose3 | None:
+        """The motion to the world of the fixes, if other states are those so far after it."""
+        found, poses = self._estimator.aiding.found, {s.stamp_ns: s.world_T_body for s in by}
+        recent = [s for s in self._recent if since_ns is None or s.stamp_ns >= since_ns]
+        if found is None or not recent:
+            return None
+        for state in recent:
+            there = poses.get(state.stamp_ns)
+            moved = found.motion.compose(state.world_T_body)
+            if there is None or not there.equals(moved, _SAME):
+                return None
+        return found.motion
 
     def check_recorded(self, time_ns: int) -> None:
         """Refuse to go on after a time of which nothing is recorded.
@@ -115,6 +140,7 @@ class Recovery:
             DivergenceError: the same, if a new start has no prospect or is not wanted.
         """
         result, measured = self._result, not isinstance(lost, JumpError)
+        self.world_motion = None
         change = self._estimator.find_clock_change() if measured else None
         if change is not None:
             lost = DivergenceError(change.message)

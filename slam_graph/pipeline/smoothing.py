@@ -81,7 +81,6 @@ class Smoothing(Stage):
 
     def _solve(self, log: backend.FrameLog) -> None:
         result = self._result
-        calibrated = result.logs.calibration.latest
         segments = result.segments
         parts: list[tuple[int, int | None]] = [
             (group[0].begin_ns, group[-1].end_ns) for group in segments.worlds()
@@ -92,7 +91,7 @@ class Smoothing(Stage):
             log,
             result.trajectory,
             parts,
-            result.causal_rig if calibrated is None else calibrated.rig,
+            result.logs.calibration.rig(result.causal_rig),
             result.config.backend,
             result.config.final_ba,
             self._progress.adjusting,

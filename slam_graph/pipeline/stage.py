@@ -12,10 +12,11 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import cv2
+import gtsam
 import numpy as np
 
 from slam_graph.arrays import FloatArray, IntArray
@@ -52,6 +53,7 @@ class EstimatedFrame:
         initialized: whether the estimator has started.
         corrected_rig: the calibration, where the estimator has corrected it; None otherwise.
         restarted: whether the estimator began anew at this frame, in another world.
+        world_motion: new_T_old, if all states of the segment have moved with their world.
         waits: whether this frame waits for IMU samples, and the state is that of an earlier one.
         milliseconds: of each stage, of its parts as `stage.part`, and of all as `total`.
         counts: what the front end counts, by name.
@@ -75,6 +77,7 @@ class EstimatedFrame:
     initialized: bool
     corrected_rig: Rig | None = None
     restarted: bool = False
+    world_motion: gtsam.Pose3 | None = None
     waits: bool = False
     milliseconds: Mapping[str, float] = field(default_factory=dict)
     counts: Mapping[str, float] = field(default_factory=dict)
@@ -100,9 +103,12 @@ class EstimatedFrame:
         return samples if self.clock_changes is None else self.clock_changes.corrected(samples)
 
     def feedback(self) -> Feedback:
-        """What the front end is told about the features."""
+        """What the front end is told about the features, on the clock of its IMU samples."""
+        state, changes = self.state, self.clock_changes
+        if state is not None and changes:
+            state = replace(state, stamp_ns=state.stamp_ns + round(changes.shift_s * 1e9))
         return Feedback.of(
-            self.state, self.rejected, self.landmark_ids, self.landmarks, self.rig_on_raw_clock
+            state, self.rejected, self.landmark_ids, self.landmarks, self.rig_on_raw_clock
         )
 
 

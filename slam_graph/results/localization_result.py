@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 from array import array
+from bisect import bisect_left
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
@@ -73,6 +74,11 @@ class LocalizationLog:
         """Add to counts, by name."""
         for name, number in counts.items():
             self.counts[name] = self.counts.get(name, 0) + number
+
+    def forget_from(self, stamp_ns: int) -> None:
+        """Forget the poses at and after a time; their frames count as not located."""
+        for row in range(bisect_left(self._stamps_ns, stamp_ns), len(self._stamps_ns)):
+            self._located[row], self._sigmas[row] = False, np.nan
 
     def __repr__(self) -> str:
         return f"LocalizationLog({int(self.located.sum())} of {len(self.located)} frames located)"

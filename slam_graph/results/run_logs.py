@@ -17,7 +17,7 @@ import numpy as np
 from slam_graph.arrays import FloatArray, GrowingTable, IntArray
 from slam_graph.backend import Innovations
 from slam_graph.results.frame_table import FrameTable
-from slam_graph.sensors import CalibrationEstimate
+from slam_graph.sensors import CalibrationEstimate, Rig
 
 
 class StepLog:
@@ -144,6 +144,10 @@ class CalibrationLog:
         kept = bisect_left(self._estimates, stamp_ns, key=lambda estimate: estimate.stamp_ns)
         del self._rows[kept:], self._estimates[kept:]
         self.latest = self._estimates[-1] if kept else None
+
+    def rig(self, given: Rig) -> Rig:
+        """The rig of the last estimate; without one that which was given."""
+        return given if self.latest is None else self.latest.rig
 
     def table(self) -> dict[str, dict[str, Any]] | None:
         """The last estimate: start, value and standard deviation of each parameter by its name."""

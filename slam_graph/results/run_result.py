@@ -112,18 +112,20 @@ class RunResult(RunSummary):
         self.localization = LocalizationLog(known)
         return self.localization
 
-    def forget_states(self, since_ns: int | None) -> None:
-        """Take back the states from a time on, and what was logged of them.
+    def forget_states(self, since_ns: int | None, moved: bool = False) -> None:
+        """Take back the states from a time on, and what rests on them: map points, objects, logs.
 
         Args:
-            since_ns: the time; None for all states. The points of the map that were estimated with
-                them go too.
+            since_ns: the time; None for all states.
+            moved: whether they come back in another world. Objects and poses in a map stay then.
         """
         if since_ns is None:
             self.history, self.point_map = self.history.like(), PointMap()
-        else:
-            self.history.forget_from(since_ns)
-            self.point_map.forget_from(since_ns)
+            since_ns = np.iinfo(np.int64).min
+        on_them = () if moved else (self.objects, self.localization)
+        for part in (self.history, self.point_map, *on_them):
+            if part is not None:
+                part.forget_from(since_ns)
         self.logs.forget_states(since_ns)
 
     @property
@@ -353,13 +355,11 @@ class RunResult(RunSummary):
             files.text(names.GROUNDTRUTH, self.groundtruth.tum_lines())
         write_ply(files.path(names.POINTS), self.points)
         files.text(names.TIMING, self.logs.timing.csv_lines())
-        frames = self.logs.by_frame.csv_lines(self.keyframes_ns, self.nees_series)
-        files.text(names.FRAMES, frames)
+        files.text(names.FRAMES, self.logs.by_frame.csv_lines(self.keyframes_ns, self.nees_series))
         files.text(names.CONFIG, [self.config.as_yaml()])
         files.text(names.RIG, [kalibr_text(self.rig)])
         files.json(names.METRICS, self.metrics)
-        calibrated = self.logs.calibration.latest
-        if calibrated is not None:
+        if (calibrated := self.logs.calibration.latest) is not None:
             files.text("calibration_estimated.yaml", [kalibr_text(calibrated.rig)])
             files.text("calibration.csv", self.logs.calibration.csv_lines())
         for stamp_ns, graph in self.graphs.items():

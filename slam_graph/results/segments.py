@@ -136,6 +136,11 @@ class Segments:
         return bool(self._all) and not self._all[-1].ended_by
 
     @property
+    def ended_ns(self) -> int | None:
+        """Time until which states are those of segments that have ended; None if none has."""
+        return max((segment.end_ns for segment in self._all if segment.ended_by), default=None)
+
+    @property
     def lasted(self) -> bool:
         """Whether a segment was good for so long that a wrong calibration is unlikely."""
         return any(segment.seconds >= self.SHORT_S for segment in self._all)

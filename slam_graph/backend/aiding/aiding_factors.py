@@ -73,6 +73,8 @@ class Aiding:
 
     Attributes:
         aligned: whether the world is that of the fixes.
+        found: how it became that; None before.
+        moved: new_T_old of its motions since then.
         used: whether there was anything to take so far.
         gates: of the sources of fixes, by name.
         odometry: of wheels or legs.
@@ -106,7 +108,8 @@ class Aiding:
         It may begin with frames that were taken before: what was received of the last seconds waits
         again. What is older than the first state finds no place on its path.
         """
-        self.aligned = False
+        self.aligned, self.moved = False, gtsam.Pose3()
+        self.found: WorldAlignment | None = None
         self._path = EstimatedPath()
         self._shifted_s = self.offset_s
         self._waiting, self._offered = self._shifted(self._data), AidingData.empty()
@@ -223,6 +226,7 @@ class Aiding:
             motion: new_T_old of the worlds.
         """
         self._path.states = in_moved_world(self._path.states, motion)
+        self.moved = motion.compose(self.moved)
         self._revised_ns = state.stamp_ns
         return in_moved_world([state], motion)[0]
 
@@ -376,6 +380,7 @@ class Aiding:
         states = in_moved_world(self._path.states, found.motion)
         states = [with_unknown_gauge(state, found.covariance, found.centre) for state in states]
         self.aligned, self._fixes, self._path.states = True, [], list(states)
+        self.found = found
         self.offset_s, self._offset_sigma_s = self.offset_s + found.offset_s, found.offset_sigma_s
         self.lever_arm_m = self.lever_arm_m + found.arm_m
         self._waiting = self._waiting.shifted(round(found.offset_s * 1e9))

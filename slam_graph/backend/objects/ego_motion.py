@@ -134,6 +134,12 @@ class EgoWindow:
         self._frames: dict[int, int] = {}  # stamp of the frame with an index in the estimator
         self._started = False
 
+    def move(self, motion: gtsam.Pose3) -> None:
+        """Move all frames with their world, by `new_T_old`."""
+        R = motion.rotation().matrix()
+        self._poses = {stamp: motion.compose(pose) for stamp, pose in self._poses.items()}
+        self._velocities = {stamp: R @ velocity for stamp, velocity in self._velocities.items()}
+
     def forget(self) -> None:
         """Forget all frames: the world is another one from now on."""
         self._poses.clear()

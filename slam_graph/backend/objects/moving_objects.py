@@ -8,6 +8,9 @@ import time
 from collections.abc import Mapping
 from dataclasses import replace
 
+import gtsam
+
+from slam_graph.backend.aiding.world_alignment import WorldAlignment
 from slam_graph.backend.backend_config import BackendConfig
 from slam_graph.backend.depth_camera import with_depth_camera, with_depth_observed
 from slam_graph.backend.estimator import Estimator
@@ -50,19 +53,46 @@ class MovingObjects(ObjectHistory):
         self._settings = policies, backend, config
         self._sigma_px = backend.noise.pixel_sigma
         self.smoothed: ObjectHistory | None = None
+        self._highest, self._offset_ns = 0, 0
         self.begin(rig)
 
     def begin(self, rig: Rig) -> None:
         """Begin without objects: the world is another one from now on; states so far stay."""
+        self._note_numbers()
         policies, backend, config = self._settings
-        self._window = EgoWindow(config.window_s)
+        self._window, self._moved = EgoWindow(config.window_s), gtsam.Pose3()
         self.single_camera = len(rig.cameras) == 1 and rig.depth is None
-        first = max([0, *self.numbers, *(seen.number for seen in self.directions)]) + 1
+        first = self._highest + 1
         self._directions = DirectionTracker(rig, backend, config, first)
         self._rig = rig
         # depth is what a second camera sees
         with_virtual = replace(with_depth_camera(rig), depth=None)
         self._tracker = ObjectTracker(with_virtual, policies, backend, config, first)
+
+    def _note_numbers(self) -> None:
+        """A number means one object for good, also once its states are forgotten."""
+        seen = (direction.number for direction in self.directions)
+        self._highest = max([self._highest, *self.numbers, *seen])
+
+    def forget_from(self, stamp_ns: int) -> None:
+        """Forget what there is of objects at and after a time on the clock of the IMU."""
+        self._note_numbers()
+        super().forget_from(stamp_ns - self._offset_ns)
+
+    def settle(self, found: WorldAlignment, since_ns: int) -> None:
+        """Take what there is of objects at and after a time, as above, to the world of fixes."""
+        super().settle(found, since_ns - self._offset_ns)
+
+    def _move(self, estimator: Estimator) -> None:
+        """Go on in the world of the platform, where fixes have moved it again.
+
+        States so far stay where they were estimated, as those of the platform do.
+        """
+        moved = estimator.aiding.moved
+        if moved is not self._moved:
+            motion, self._moved = moved.compose(self._moved.inverse()), moved
+            self._window.move(motion)
+            self._tracker.move(motion)
 
     def take(self, frame: FeatureFrame, state: NavState, estimator: Estimator) -> ObjectFrame:
         """Take a frame, and leave what moves out of the estimate of the platform.
@@ -73,6 +103,8 @@ class MovingObjects(ObjectHistory):
             estimator: of the platform, after the frame.
         """
         began = time.perf_counter()
+        self._offset_ns = state.stamp_ns - frame.stamp_ns
+        self._move(estimator)
         ego = self._window.add(frame.stamp_ns, state, estimator)
         if ego is None:
             return ObjectFrame()

@@ -4,8 +4,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
+import gtsam
 import numpy as np
 
 from slam_graph.arrays import FloatArray, IntArray
@@ -38,6 +39,11 @@ class ObjectDirection:
     sigma: float
     rate_sigma: float
     points: int
+
+    def moved(self, motion: gtsam.Pose3) -> ObjectDirection:
+        """The same in a world that is moved by `new_T_old`."""
+        R = motion.rotation().matrix()
+        return replace(self, direction=R @ self.direction, rate=R @ self.rate)
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,6 +11,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from slam_graph.arrays import FloatArray, IntArray
+from slam_graph.backend.aiding.world_alignment import WorldAlignment
 from slam_graph.backend.objects.object_errors import ObjectErrors, object_errors
 from slam_graph.backend.objects.object_frame import ObjectDirection
 from slam_graph.backend.objects.object_state import ObjectMotion, ObjectState
@@ -59,6 +60,33 @@ class ObjectHistory:
         for item in objects:
             if item.number in self._states:
                 self.points[item.number] = item.points()
+
+    def forget_from(self, stamp_ns: int) -> None:
+        """Forget states and directions at and after a time, and objects that have none before."""
+        for number in self.numbers:
+            states = [state for state in self._states[number] if state.stamp_ns < stamp_ns]
+            self._states[number] = states
+            if not states:
+                del self._states[number]
+                self.points.pop(number, None)
+        self.directions = [seen for seen in self.directions if seen.stamp_ns < stamp_ns]
+
+    def settle(self, found: WorldAlignment, since_ns: int) -> None:
+        """Take states and directions at and after a time to the world of the fixes.
+
+        Points stay as they are, in the frame of their object.
+        """
+        for number, states in self._states.items():
+            self._states[number] = [
+                state.moved(found.motion).with_unknown_gauge(found.covariance, found.centre)
+                if state.stamp_ns >= since_ns
+                else state
+                for state in states
+            ]
+        self.directions = [
+            seen.moved(found.motion) if seen.stamp_ns >= since_ns else seen
+            for seen in self.directions
+        ]
 
     def states(self, number: int) -> list[ObjectState]:
         """States of an object, in the order of time."""

@@ -4,13 +4,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
 
 from slam_graph.arrays import FloatArray
 from slam_graph.backend.objects.relative_motion import RelativeStep
+from slam_graph.backend.world_gauge import gauge_motion
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,8 +75,8 @@ class ObjectState:
         stamp_ns: time of the frame, on the clock of the cameras.
         number: of the object.
         label: of its mask; 0 without one.
-        world_T_object: its pose. The frame of an object has the axes of the world and its origin in
-            the middle of the points where the object was found first.
+        world_T_object: its pose. The frame of an object has the axes that the world had and its
+            origin in the middle of the points where the object was found first.
         covariance: (6, 6) of the tangent of the pose.
         world_T_body: the platform then.
         step: motion since the frame before; None where it is not known.
@@ -96,3 +97,27 @@ class ObjectState:
     velocity_covariance: FloatArray
     moving: bool
     points: int
+
+    def moved(self, motion: gtsam.Pose3) -> ObjectState:
+        """The same in a world that is moved by `new_T_old`."""
+        R = motion.rotation().matrix()
+        return replace(
+            self,
+            world_T_object=motion.compose(self.world_T_object),
+            world_T_body=motion.compose(self.world_T_body),
+            velocity=R @ self.velocity,
+            velocity_covariance=R @ self.velocity_covariance @ R.T,
+        )
+
+    def with_unknown_gauge(self, unknown: FloatArray, centre: FloatArray) -> ObjectState:
+        """The same with the uncertainty of the gauge of its world added to that of the pose.
+
+        Args:
+            unknown: (4, 4) or (6, 6) covariance of the gauge (m, rad).
+            centre: (3,) the point about which the world turns.
+        """
+        arm = self.world_T_object.translation() - centre
+        N = gauge_motion(arm[None], level=len(unknown) == 4)[0]
+        object_R_world = self.world_T_object.rotation().matrix().T
+        N = np.vstack([object_R_world @ N[:3], object_R_world @ N[3:]])
+        return replace(self, covariance=self.covariance + N @ unknown @ N.T)

@@ -122,6 +122,11 @@ class ObjectTracker:
         self._merge(ego)
         return self._described(states, test)
 
+    def move(self, motion: gtsam.Pose3) -> None:
+        """Move the objects with their world, by `new_T_old`."""
+        for item in (*self.objects, *self._hidden):
+            item.state = None if item.state is None else item.state.moved(motion)
+
     # --- objects that are known ------------------------------------------------------------------
 
     def _follow(self, ego: EgoMotion, noise_px: float) -> list[ObjectState]:
