@@ -24,7 +24,8 @@ from benchmarks.metric import EXACT, Metric, info
 from benchmarks.recordings import FIRST_HELD_OUT_SEED
 from benchmarks.suite import Benchmark, Outcome
 from slam_graph.arrays import skew
-from slam_graph.backend import Estimator, triangulate_frames
+from slam_graph.backend import Estimator
+from slam_graph.backend.cost.triangulation import triangulate_frames
 from slam_graph.config import RunConfig, load_config
 from slam_graph.geometry import NavState, Trajectory
 from slam_graph.sensors import FeatureFrame, ImuData, Packet, Rig

@@ -7,14 +7,16 @@ from dataclasses import replace
 import gtsam
 import numpy as np
 import pytest
+from flight import rig, room
 from loop_flights import CONFIG, tour, true_relative
 from scipy.spatial.transform import Rotation
+from test_rolling_shutter import FAST, rolling, rows_of
 
 from slam_graph.evaluation.absolute_pose_error import ape
 from slam_graph.geometry.trajectory import Trajectory
 from slam_graph.loop_closure.loop_closing import LoopClosures, close_loops, correct_by
-from slam_graph.loop_closure.loop_config import VerificationConfig
-from slam_graph.loop_closure.loop_keyframes import Keyframe
+from slam_graph.loop_closure.loop_config import KeyframeConfig, VerificationConfig
+from slam_graph.loop_closure.loop_keyframes import Keyframe, KeyframeLog
 from slam_graph.loop_closure.loop_pose_graph import level_graph, split_yaw
 from slam_graph.loop_closure.loop_verification import (
     FLOOR_SIGMAS,
@@ -24,7 +26,7 @@ from slam_graph.loop_closure.loop_verification import (
 )
 from slam_graph.pose_graph.graph import PoseGraph, Poses
 from slam_graph.pose_graph.optimize import optimize_pose_graph
-from slam_graph.sensors.rig import Rig
+from slam_graph.sensors import DepthSensor, FeatureFrame, FeatureObservations, Rig
 
 Tour = tuple[Rig, list[Keyframe], Trajectory, Trajectory]
 
@@ -100,6 +102,61 @@ def test_a_point_seen_again_is_where_it_was(flown: Tour) -> None:
     assert np.abs(error).max() < 2.3e-4
 
 
+def logged(mounted: Rig, frames: list[FeatureFrame], poses: list[gtsam.Pose3]) -> Keyframe:
+    """The last keyframe of some frames."""
+    log = KeyframeLog(mounted, KeyframeConfig(angle_rad=0.3))
+    for frame, pose in zip(frames, poses, strict=True):
+        first = frame.cameras[0]
+        first = replace(first, descriptors=np.zeros((len(first), 32), np.uint8))
+        log.add(replace(frame, cameras=(first, *frame.cameras[1:])), pose)
+    return log.keyframes[-1]
+
+
+def test_rows_of_a_keyframe_are_seen_from_one_pose() -> None:
+    """A rolling shutter, by poses alone: as a global one up to how rates change."""
+    mounted, points = rolling(), room(300, np.random.default_rng(3))
+    times = np.linspace(1.0, 1.5, 11).tolist()
+    frames = [rows_of(FAST, mounted, points, t) for t in times]
+    keyframe = logged(mounted, frames, [FAST.nav_state(t).world_T_body for t in times])
+    exact = np.asarray(keyframe.world_T_body.transformTo(points[keyframe.ids].T)).T
+    camera = mounted.cameras[0].body_T_camera
+    local = np.asarray(camera.transformTo(exact.T)).T
+    at_once = local[:, :2] / local[:, 2:]
+    by_row = next(f for f in frames if f.stamp_ns == keyframe.stamp_ns).cameras[0].normalized
+    known = np.isfinite(keyframe.points).all(axis=1)
+    assert np.count_nonzero(known) > 20
+    away = np.linalg.norm(keyframe.points - exact, axis=1)[known]
+    assert np.median(away) < 0.02
+    errors = np.linalg.norm(keyframe.normalized - at_once, axis=1)
+    assert np.median(errors) < 0.1 * np.median(np.linalg.norm(by_row - at_once, axis=1))
+
+
+def test_measured_depths_are_points_of_a_keyframe() -> None:
+    """Of a camera that only turns, which triangulates nothing."""
+    mounted = replace(rig(1), depth=DepthSensor())
+    points, camera = room(300, np.random.default_rng(3)), mounted.cameras[0].body_T_camera
+    frames, poses = [], []
+    for k in range(5):
+        turn = gtsam.Pose3(gtsam.Rot3.Rz(0.1 * k), np.zeros(3))
+        poses.append(camera * turn * camera.inverse())  # about the axis of the camera
+        local = np.asarray(poses[-1].compose(camera).transformTo(points.T)).T
+        plane = local[:, :2] / local[:, 2:]
+        ids = np.flatnonzero((np.abs(plane) < 0.4).all(axis=1) & (local[:, 2] > 0.5))
+        depth = local[ids, 2]
+        pixels = mounted.cameras[0].camera.distort(plane[ids])[0]
+        sigma = DepthSensor().sigma_m(depth)
+        seen = FeatureObservations(
+            ids, pixels, plane[ids], depth_m=np.where(ids % 2, depth, np.nan), depth_sigma_m=sigma
+        )
+        frames.append(FeatureFrame((k + 1) * 10**8, (seen,)))
+    keyframe = logged(mounted, frames, poses)
+    known = np.isfinite(keyframe.points).all(axis=1)
+    exact = np.asarray(keyframe.world_T_body.transformTo(points[keyframe.ids].T)).T
+    assert known.sum() > 10
+    np.testing.assert_array_equal(known, keyframe.ids % 2 == 1)
+    np.testing.assert_allclose(keyframe.points[known], exact[known], atol=1e-6)
+
+
 def test_a_tilted_loop_is_refused(flown: Tour) -> None:
     """What contradicts gravity is no loop, however well the points fit."""
     rig, keyframes, _, _ = flown
@@ -151,6 +208,19 @@ def test_false_loops_stay_out(flown: Tour, closed: LoopClosures) -> None:
     before = ape(truth, closed.correct(drifting), "trans_part", "yaw").statistics.rmse
     after = ape(truth, mixed.correct(drifting), "trans_part", "yaw").statistics.rmse
     assert after == pytest.approx(before, rel=0.02)
+
+
+def test_a_loop_between_consecutive_keyframes_is_no_odometry(
+    flown: Tour, closed: LoopClosures
+) -> None:
+    """Of two keyframes in a row a true loop is kept, and a false one is rejected."""
+    _, keyframes, _, _ = flown
+    n = len(keyframes) // 2
+    true = keyframes[n].world_T_body.between(keyframes[n + 1].world_T_body)
+    away = gtsam.Pose3(gtsam.Rot3(), np.array([3.0, 0.0, 0.0]))
+    for pose, kept in ((true, True), (true.compose(away), False)):
+        loop = replace(closed.loops[0], first=n, second=n + 1, first_T_second=pose)
+        assert correct_by(keyframes, [*closed.loops, loop], CONFIG).accepted[-1] == kept
 
 
 def test_level_graphs_have_level_optima() -> None:

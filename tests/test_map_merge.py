@@ -11,7 +11,7 @@ from map_flights import CONFIG, World
 
 from slam_graph.errors import EstimationError
 from slam_graph.maps.map_config import LocalizationConfig
-from slam_graph.maps.map_merge import MIN_LINKS, merge_maps
+from slam_graph.maps.map_merge import MIN_LINKS, _aligned, _matched, merge_maps
 from slam_graph.maps.map_model import SlamMap
 from slam_graph.pose_graph.graph import Poses
 
@@ -77,3 +77,20 @@ def test_maps_of_different_places_are_refused(world: World) -> None:
 def test_too_small_an_overlap_is_refused(world: World) -> None:
     with pytest.raises(EstimationError, match="share no place"):
         merge_maps(world.map(range(8)), world.map(range(MIN_LINKS - 1)), LOOPS, LOCALIZATION)
+
+
+def test_days_between_recordings_are_no_drift(world: World) -> None:
+    """False matches with the recording of another day are as inconsistent as on the same day."""
+    later, day_ns = world.map(range(3, 11)), 86_400 * 10**9
+    for days in (0, 30):
+        again = replace(later, stamps_ns=later.stamps_ns + days * day_ns)
+        first = merge_maps(world.map(range(8)), again, LOOPS, LOCALIZATION).content
+        second = world.map(range(11))
+        found = list(_matched(first, second, LOOPS, LOCALIZATION, True))
+        assert len(found) == 11
+        for k in (8, 9, 10):
+            wrong = found[k].match.world_T_body.compose(gtsam.Pose3(gtsam.Rot3(), [2.5, 0.0, k]))
+            match = replace(found[k].match, place=8 + 7, world_T_body=wrong)
+            found[k] = replace(found[k], match=match)
+        group, _ = _aligned(first, second, found, LOCALIZATION, True)
+        assert [one.number for one in group] == list(range(8))

@@ -173,6 +173,24 @@ def test_two_bodies_taken_for_one_become_two() -> None:
     assert found == [scene.ids(1).tolist(), scene.ids(0).tolist()]
 
 
+@pytest.mark.parametrize("left", [0, 30])
+def test_what_the_first_camera_does_not_see_another_one_may(left: int) -> None:
+    """Two bodies become two all the same, and tracks that no camera sees are of none."""
+    bodies = [
+        Body(cube((x, 0.0, 3.5)), (0.5 * x, 0.3, -0.3 * x), (0.0, 0.4 * x, 0.0)) for x in (-1, 1)
+    ]
+    scene = Scene(bodies)
+    item, (first, second) = scene.object(np.arange(40)), scene.window.frames[-1].cameras
+    first, second = first.select(first.ids < left), second.select(second.ids < 38)
+    scene.window.frames[-1] = FeatureFrame(scene.stamps[-1], (first, second))
+    ids, pixels = scene.window.pixels(item.members)
+    assert ids.tolist() == list(range(38))
+    np.testing.assert_array_equal(pixels[:left], first.pixels)
+    np.testing.assert_array_equal(pixels[left:], second.pixels[left:])
+    found = sorted(part.members.tolist() for part in scene.review().of(item))
+    assert found == [list(range(20)), list(range(20, 38))]
+
+
 @pytest.mark.parametrize("count", [7, 20, 60])
 def test_one_body_stays_one(count: int) -> None:
     scene = Scene([Body(cube((0.3, 0.0, 3.5), count), (0.5, 0.0, 0.3), (0.0, 0.6, 0.0))])
@@ -190,7 +208,7 @@ def test_a_track_goes_over_to_the_object_that_it_fits() -> None:
     other.members = scene.ids(1)[3:-2]
     obs = scene.window.observations(np.arange(70), 3, scene.stamps)
     free = obs.subset(~np.isin(obs.ids, [*one.members, *other.members]))
-    projection = scene.window.projection
+    projection = scene.window.projection()
     test = judge_tracks(free, projection, scene.ego, SIGMA_PX, BACKEND, CONFIG)
     labels = TrackLabels(scene.window.frames[-1])
     TrackAssignment(scene.window, labels, scene.ego, SIGMA_PX).join([one, other], test)

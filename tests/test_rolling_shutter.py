@@ -21,8 +21,13 @@ from slam_graph.backend.backend_config import BackendConfig, CalibrationConfig
 from slam_graph.backend.cost.calibrated_projection import CalibratedProjection
 from slam_graph.backend.cost.feature_tracks import FeatureTracks, Observations
 from slam_graph.backend.cost.reprojection import Geometry, RigProjection
+from slam_graph.backend.cost.row_unrolling import unrolled
 from slam_graph.backend.cost.triangulation import triangulate
 from slam_graph.backend.estimator import Estimator
+from slam_graph.backend.objects.ego_motion import EgoMotion
+from slam_graph.backend.objects.motion_test import judge_tracks
+from slam_graph.backend.objects.objects_config import ObjectsConfig
+from slam_graph.backend.objects.track_window import TrackWindow
 from slam_graph.backend.online_calibration import CalibrationVariables, rolling_motion
 from slam_graph.backend.solve.square_root import SquareRootInformation
 from slam_graph.backend.solve.state import FrameMotion, State, dims_of
@@ -189,6 +194,61 @@ def test_the_front_end_turns_rows_to_one_time_and_back() -> None:
     np.testing.assert_allclose(found[a], at_once.normalized[b], atol=2e-4)
     back = predictor._rolled(found, seen.stamp_ns)
     np.testing.assert_allclose(back, rows.pixels, atol=0.05)
+
+
+# --- moving objects -------------------------------------------------------------------------------
+
+
+def test_rows_are_unrolled_to_one_time() -> None:
+    """Where depths are known, up to how the rates of a fast flight change."""
+    mounted, points = rolling(), room(300, np.random.default_rng(3))
+    nav, imu = FAST.nav_state(1.0), ImuBuffer()
+    imu.add(FAST.imu(0.9, 1.1))
+    frame = rows_of(FAST, mounted, points, 1.0)
+    rows, at_once = frame.cameras[0], features(FAST, rig(), points, 1.0).cameras[0]
+    _, a, b = np.intersect1d(rows.ids, at_once.ids, return_indices=True)
+    camera = nav.world_T_body.compose(mounted.cameras[0].body_T_camera)
+    depths = camera.transformTo(points[rows.ids[a]].T)[2]
+    found = unrolled(rows, a, mounted, rolling_motion(nav, frame.stamp_ns, imu, mounted), depths)
+    assert len(a) > 20
+    assert np.max(np.abs(rows.normalized[a] - at_once.normalized[b])) > 5e-3
+    np.testing.assert_allclose(found, at_once.normalized[b], atol=3e-4)
+
+
+@pytest.mark.parametrize("speed", [0.0, 2.0])
+def test_rows_are_no_motion_of_what_is_rigid(speed: float) -> None:
+    """Neither of a static world, nor of an object, in whose frame the flight is `FAST`."""
+    mounted, points, imu = rolling(), room(300, np.random.default_rng(3)), ImuBuffer()
+    imu.add(FAST.imu(0.9, 1.6))
+    object_motion = speed * np.array([0.2, -0.1, 0.3, 1.0, 0.5, -0.2])
+
+    def in_world(t_s: float) -> gtsam.Pose3:
+        return gtsam.Pose3.Expmap(object_motion * t_s).compose(FAST.nav_state(t_s).world_T_body)
+
+    window, times = TrackWindow(mounted, BackendConfig()), 1.0 + 0.1 * np.arange(6)
+    in_object, motions = dict[int, gtsam.Pose3](), dict[int, FrameMotion]()
+    for t in times.tolist():
+        frame, nav = rows_of(FAST, mounted, points, t), FAST.nav_state(t)
+        step = in_world(t - 1e-4).between(in_world(t + 1e-4))
+        motion = rolling_motion(nav, frame.stamp_ns, imu, mounted)
+        motions[frame.stamp_ns] = replace(motion, rate=gtsam.Pose3.Logmap(step) / 2e-4)
+        in_object[frame.stamp_ns] = nav.world_T_body
+        poses = tuple(in_world(t) for t in times[: len(motions)])
+        still, none = np.zeros((len(poses), 3)), np.zeros((6, 6))
+        small = 1e-10 * np.eye(3)
+        ego = EgoMotion(tuple(motions), poses, still, nav, small, small, none, motions)
+        window.add(frame, 0, ego)
+    ids, squares, dof = window.misfit(window.seen, in_object, 0.5)
+    assert len(ids) > 50
+    assert np.max(squares / dof) < 0.5
+    if speed == 0.0:
+        obs = window.observations(ids, 3, window.stamps_ns)
+        rig_now = window.projection(window.stamps_ns, poses)
+        test = judge_tracks(obs, rig_now, ego, 0.5, BackendConfig(), ObjectsConfig())
+        assert not test.moves.any()
+    window.add(frame, 0)
+    _, ignored_rows, _ = window.misfit(ids, in_object, 0.5)
+    assert np.median(ignored_rows / dof) > 2.0
 
 
 # --- files ----------------------------------------------------------------------------------------

@@ -24,12 +24,12 @@ __all__ = [
     "ObjectSmoother",
     "ObjectsConfig",
     "PoseSelection",
+    "PosedFrame",
     "RigProjection",
     "RobustLoss",
     "TenfoldDamping",
     "WindowGraph",
     "levenberg_marquardt",
-    "triangulate_frames",
     "visual_rotation",
 ]
 
@@ -44,13 +44,13 @@ if TYPE_CHECKING:
         FeaturePolicy,
         PoseSelection,
     )
-    from slam_graph.backend.cost.triangulation import triangulate_frames
     from slam_graph.backend.estimator import Estimator
     from slam_graph.backend.initialization.visual_rotation import visual_rotation
     from slam_graph.backend.objects.moving_objects import MovingObjects
     from slam_graph.backend.objects.object_frame import ObjectFrame
     from slam_graph.backend.objects.objects_config import ObjectsConfig
     from slam_graph.backend.policies import AlgorithmConfig
+    from slam_graph.backend.posed_frame import PosedFrame
     from slam_graph.backend.smoothing.final_adjustment import FinalBa
     from slam_graph.backend.smoothing.frame_log import FrameLog
     from slam_graph.backend.smoothing.object_smoothing import ObjectSmoother
@@ -76,13 +76,13 @@ else:
                 "FeaturePolicy",
                 "PoseSelection",
             ),
-            "cost.triangulation": ("triangulate_frames",),
             "estimator": ("Estimator",),
             "initialization.visual_rotation": ("visual_rotation",),
             "objects.moving_objects": ("MovingObjects",),
             "objects.object_frame": ("ObjectFrame",),
             "objects.objects_config": ("ObjectsConfig",),
             "policies": ("AlgorithmConfig",),
+            "posed_frame": ("PosedFrame",),
             "smoothing.final_adjustment": ("FinalBa",),
             "smoothing.frame_log": ("FrameLog",),
             "smoothing.object_smoothing": ("ObjectSmoother",),

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam_graph.arrays import FloatArray, IntArray
-from slam_graph.backend import triangulate_frames
+from slam_graph.backend import PosedFrame
 from slam_graph.frontend import DESCRIPTORS, Image, Keypoints
 from slam_graph.geometry import Trajectory, interpolate
 from slam_graph.loop_closure.loop_config import KeyframeConfig
@@ -28,6 +28,8 @@ POINT_FRAMES = 10
 """Number of recent frames from which the points of a keyframe are triangulated …"""
 POINT_FRAME_SPACING_S = 0.1
 """… and the time between them: within a second the estimator hardly drifts."""
+_LAST_POSES = 3
+"""Poses that tell how the body moves while a rolling shutter exposes a frame."""
 MAX_REPROJECTION_PX = 3.0
 """Points of a larger root-mean-square reprojection error are left out."""
 MAX_DEPTH_ERROR = 0.1
@@ -42,21 +44,6 @@ Descriptors = NDArray[np.uint8]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class View:
-    """A recent frame and its pose."""
-
-    frame: FeatureFrame
-    rotation: FloatArray
-    position: FloatArray
-
-    def moved(self, motion: gtsam.Pose3) -> View:
-        """The same in a world that is moved by `new_T_old`."""
-        R = motion.rotation().matrix()
-        position = R @ self.position + motion.translation()
-        return View(self.frame, R @ self.rotation, position)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class Keyframe:
     """A frame as place recognition, loop closure and maps use it.
 
@@ -64,7 +51,7 @@ class Keyframe:
         stamp_ns: time.
         world_T_body: estimate of the pose.
         ids: (N,) features seen by the first camera; -1 for corners that are not tracked.
-        normalized: (N, 2) observations on the plane z = 1.
+        normalized: (N, 2) observations on the plane z = 1, all from the pose.
         descriptors: (N, B) binary descriptors.
         points: (N, 3) in the body frame, metres; NaN where not triangulated. Drift so moves them
             with the keyframe.
@@ -78,7 +65,7 @@ class Keyframe:
     normalized: FloatArray
     descriptors: Descriptors
     points: FloatArray
-    views: tuple[View, ...] = ()
+    views: tuple[PosedFrame, ...] = ()
 
     def moved(self, motion: gtsam.Pose3) -> Keyframe:
         """The same in a world that is moved by `new_T_old`."""
@@ -164,7 +151,8 @@ class KeyframeLog:
         camera = rig.cameras[0].camera
         self._describer = KeyframeDescriber(camera, config.further_corners)
         self._focal_px = float(np.sqrt(camera.fx * camera.fy))
-        self._recent: deque[View] = deque(maxlen=POINT_FRAMES)
+        self._recent: deque[PosedFrame] = deque(maxlen=POINT_FRAMES)
+        self._last: deque[tuple[int, gtsam.Pose3]] = deque(maxlen=_LAST_POSES)
 
     def add(
         self, frame: FeatureFrame, world_T_body: gtsam.Pose3, image: Image | None = None
@@ -176,27 +164,28 @@ class KeyframeLog:
             world_T_body: causal estimate of its pose.
             image: of the first camera.
         """
+        self._last.append((frame.stamp_ns, world_T_body))
         wanted = self._is_keyframe(frame, world_T_body)
         spacing_ns = POINT_FRAME_SPACING_S * 1e9
         if self._recent and frame.stamp_ns - self._recent[-1].frame.stamp_ns < spacing_ns:
             if not wanted:
                 return None
             self._recent.pop()
-        rotation = world_T_body.rotation().matrix()
-        self._recent.append(View(frame, rotation, world_T_body.translation()))
+        self._recent.append(PosedFrame.of(frame, tuple(self._last), self.rig))
         seen = frame.cameras[0]
         if wanted and image is not None:
             seen = self._describer.describe(image, seen)
         if not wanted or seen.descriptors is None or len(seen) == 0:
             return None
         views = tuple(self._recent)
+        points = self._points(seen.ids, views, world_T_body)
         keyframe = Keyframe(
             frame.stamp_ns,
             world_T_body,
             seen.ids,
-            seen.normalized,
+            views[-1].unrolled(seen, points, self.rig),
             seen.descriptors,
-            self._points(seen.ids, views, world_T_body),
+            points,
             () if self.rig.has_scale else views,
         )
         self.keyframes.append(keyframe)
@@ -209,6 +198,8 @@ class KeyframeLog:
             for k in self.keyframes
         ]
         self._recent = deque((view.moved(motion) for view in self._recent), maxlen=POINT_FRAMES)
+        last = ((stamp_ns, motion.compose(pose)) for stamp_ns, pose in self._last)
+        self._last = deque(last, maxlen=_LAST_POSES)
 
     def at(self, trajectory: Trajectory) -> list[Keyframe]:
         """The keyframes at the poses of a trajectory; those outside of it keep their poses.
@@ -246,25 +237,15 @@ class KeyframeLog:
         """(N, 3) points of a keyframe, triangulated from the poses of a trajectory."""
         stamps_ns = np.array([view.frame.stamp_ns for view in keyframe.views])
         found, valid = interpolate(trajectory, stamps_ns)
-        moved = [found.pose(row) for row in range(len(found))]
-        used = [keyframe.views[k] for k in np.flatnonzero(valid).tolist()]
-        views = [
-            View(view.frame, at.rotation().matrix(), at.translation())
-            for view, at in zip(used, moved, strict=True)
-        ]
+        used = np.flatnonzero(valid).tolist()
+        views = [keyframe.views[k].at(found.pose(row)) for row, k in enumerate(used)]
         return self._points(keyframe.ids, views, pose) if len(views) > 1 else keyframe.points
 
     def _points(
-        self, ids: IntArray, views: Sequence[View], world_T_body: gtsam.Pose3
+        self, ids: IntArray, views: Sequence[PosedFrame], world_T_body: gtsam.Pose3
     ) -> FloatArray:
         """(N, 3) points of features (N,) in the body frame; NaN where not triangulated."""
-        found = triangulate_frames(
-            ids,
-            [view.frame for view in views],
-            np.array([view.rotation for view in views]),
-            np.array([view.position for view in views]),
-            self.rig,
-        )
+        found = PosedFrame.triangulated(ids, views, self.rig)
         good = found.good & (found.reprojection_px < MAX_REPROJECTION_PX)
         good &= found.depth_error < MAX_DEPTH_ERROR * self._focal_px
         points = np.where(good[:, None], found.points, np.nan)

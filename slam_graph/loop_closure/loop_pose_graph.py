@@ -19,6 +19,7 @@ which is robust to false loop closures.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Protocol
 
 import numpy as np
@@ -162,13 +163,11 @@ def level_graph(graph: PoseGraph) -> PoseGraph:
     A_i, A_j = rest.select(i), rest.select(j)
     measured = A_i.compose(graph.measured).compose(A_j.inverse())
     turns = split_yaw(Poses(measured.rotations, np.zeros_like(measured.translations)))[0]
-    return PoseGraph(
-        graph.keys,
-        upright,
-        graph.edges,
-        Poses(turns.rotations, measured.translations),
-        _level_information(graph.information, A_i.rotations, A_j.rotations),
-        name=graph.name,
+    return replace(
+        graph,
+        estimates=upright,
+        measured=Poses(turns.rotations, measured.translations),
+        information=_level_information(graph.information, A_i.rotations, A_j.rotations),
     )
 
 

@@ -18,6 +18,8 @@ from datetime import UTC, datetime
 
 import gtsam
 import numpy as np
+from scipy.sparse import csr_matrix
+from scipy.sparse.csgraph import dijkstra
 
 from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.errors import EstimationError
@@ -196,14 +198,15 @@ def _solved(
         )
         for n, ends in enumerate(own.ends)
     ]
-    # an edge between consecutive numbers would count as odometry, which is never rejected
-    usable = [abs(loop.first - loop.second) > 1 for loop in between]
-    loops = inner + [loop for loop, good in zip(between, usable, strict=True) if good]
     poses, inliers, _ = correct_keyframes(
-        joined.stamps_ns, joined.poses, loops, config, level, recording_of=joined.recording_of
+        joined.stamps_ns,
+        joined.poses,
+        inner + between,
+        config,
+        level,
+        recording_of=joined.recording_of,
     )
-    kept = iter(inliers[len(inner) :].tolist())
-    return poses, [good and next(kept) for good in usable]
+    return poses, inliers[len(inner) :].tolist()
 
 
 def _body_points(content: SlamMap) -> FloatArray:
@@ -320,16 +323,24 @@ def _aligned(
     """
     best: list[_Matched] = []
     alignment = gtsam.Pose3()
+    ways = _ways(first), _ways(second)
     step = max(len(matches) / _HYPOTHESES, 1.0)
     for row in np.arange(0, len(matches), step).astype(int).tolist():
         trial = matches[row]
         body = second.pose(trial.number)
+        ends = trial.match.place, trial.number
+        past_ns = [
+            dijkstra(way, directed=False, indices=end) for way, end in zip(ways, ends, strict=True)
+        ]
         group = []
         for other in matches:
+            apart_ns = past_ns[0][other.match.place] + past_ns[1][other.number]
+            if not np.isfinite(apart_ns):
+                continue
             filter_ = MapPoseFilter(
                 config, level, body, trial.match.world_T_body, trial.match.covariance, 0
             )
-            filter_.move(_apart_ns(first, second, trial, other), second.pose(other.number))
+            filter_.move(round(apart_ns), second.pose(other.number))
             if filter_.distance(other.match.world_T_body, other.match.covariance) < CONSISTENT_CHI2:
                 group.append(other)
         if len(group) > len(best):
@@ -340,12 +351,16 @@ def _aligned(
     return best, alignment
 
 
-def _apart_ns(first: SlamMap, second: SlamMap, one: _Matched, other: _Matched) -> int:
-    """Time during which odometry drifted between two matches, in both maps."""
-    stretches = (
-        (first, one.match.place, other.match.place),
-        (second, one.number, other.number),
-    )
-    return sum(
-        abs(int(content.stamps_ns[a]) - int(content.stamps_ns[b])) for content, a, b in stretches
-    )
+def _ways(content: SlamMap) -> csr_matrix:
+    """(K, K) time in ns during which odometry drifts from one keyframe of a map to another.
+
+    Those of one recording are joined in the order of time, and those of different recordings, whose
+    clocks have nothing in common, by the links between them, along which nothing drifts.
+    """
+    count, recording_of = len(content.stamps_ns), content.recording_of
+    before = np.flatnonzero(np.diff(recording_of) == 0)
+    across = content.links.ends[np.diff(recording_of[content.links.ends])[:, 0] != 0]
+    ends = np.concatenate([np.column_stack([before, before + 1]), across])
+    times = np.maximum(np.diff(content.stamps_ns)[before], 1)
+    values = np.concatenate([times, np.ones(len(across))])  # 0 would be none
+    return csr_matrix((values, tuple(ends.T)), shape=(count, count))

@@ -121,6 +121,7 @@ class PoseGraph(Displayed):
         rotation_information: whether the information of a 3D rotation belongs to the angle (GTSAM)
             or to the vector part of the quaternion (g2o).
         name: of the graph.
+        odometry: (M,) whether each edge is odometry; those between consecutive poses if not given.
     """
 
     keys: IntArray
@@ -130,6 +131,7 @@ class PoseGraph(Displayed):
     information: FloatArray
     rotation_information: RotationInformation = "angle"
     name: str = "pose graph"
+    odometry: BoolArray | None = None
 
     def __repr__(self) -> str:
         loops = int(np.count_nonzero(~self.is_odometry))
@@ -200,7 +202,9 @@ class PoseGraph(Displayed):
 
     @property
     def is_odometry(self) -> BoolArray:
-        """(M,) whether an edge joins consecutive poses; all others are loop closures."""
+        """(M,) whether an edge is odometry; all others are loop closures."""
+        if self.odometry is not None:
+            return self.odometry
         consecutive: BoolArray = np.abs(np.diff(self.edges, axis=1))[:, 0] == 1
         return consecutive
 
@@ -230,6 +234,7 @@ class PoseGraph(Displayed):
             edges=self.edges[kept],
             measured=self.measured.select(kept),
             information=self.information[kept],
+            odometry=None if self.odometry is None else self.odometry[kept],
         )
 
     def weighted(self, weights: FloatArray) -> PoseGraph:
@@ -237,12 +242,13 @@ class PoseGraph(Displayed):
         return replace(self, information=self.information * weights[:, None, None])
 
     def add_edges(self, edges: IntArray, measured: Poses, information: FloatArray) -> PoseGraph:
-        """The graph with edges appended."""
+        """The graph with loop closures appended, which may join consecutive poses, too."""
         return replace(
             self,
             edges=np.concatenate([self.edges, edges]),
             measured=self.measured.concatenated(measured),
             information=np.concatenate([self.information, information]),
+            odometry=np.concatenate([self.is_odometry, np.zeros(len(edges), np.bool_)]),
         )
 
     def trajectory(self, poses: Poses) -> Trajectory:

@@ -11,7 +11,7 @@ is not the same everywhere on that plane.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,7 +20,7 @@ from slam_graph.arrays import BoolArray, FloatArray, IntArray
 from slam_graph.backend.backend_config import TriangulationConfig
 from slam_graph.backend.cost.feature_tracks import Observations, is_in
 from slam_graph.backend.cost.reprojection import Geometry, RigProjection
-from slam_graph.backend.solve.state import State
+from slam_graph.backend.solve.state import FrameMotion, State
 from slam_graph.kernels.ray_triangulation import triangulate_rays
 from slam_graph.sensors import FeatureFrame, Rig
 
@@ -114,6 +114,7 @@ def triangulate_frames(
     rotations: FloatArray,
     positions: FloatArray,
     rig: Rig,
+    motions: Mapping[int, FrameMotion] | None = None,
 ) -> Triangulation:
     """Triangulate features from frames at known poses, with the default thresholds.
 
@@ -123,6 +124,7 @@ def triangulate_frames(
         rotations: (F, 3, 3) world_R_body of the frames.
         positions: (F, 3) of the body in the world.
         rig: the cameras.
+        motions: of the body within frames 0, 1, …, for rolling shutters.
 
     Returns:
         One row for each id; features with fewer than two observations are not good, and their
@@ -136,7 +138,8 @@ def triangulate_frames(
     good = np.zeros(len(ascending), np.bool_)
     reprojection_px, depth_error = np.full((2, len(ascending)), np.inf)
     if len(obs):
-        found = triangulate(obs, RigProjection(rig), rotations, positions, TriangulationConfig())
+        projection = RigProjection(rig, motions)
+        found = triangulate(obs, projection, rotations, positions, TriangulationConfig())
         points[seen], good[seen] = found.points, found.good
         reprojection_px[seen], depth_error[seen] = found.reprojection_px, found.depth_error
     place = np.searchsorted(ascending, ids)

@@ -4,7 +4,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import gtsam
@@ -14,6 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from slam_graph.arrays import FloatArray
 from slam_graph.backend.estimator import Estimator
+from slam_graph.backend.solve.state import FrameMotion
 from slam_graph.errors import EstimationError
 from slam_graph.geometry import NavState
 from slam_graph.sensors import ImuData
@@ -35,6 +37,7 @@ class EgoMotion:
         rate_covariance: (3, 3) of the mean angular rate over them, rad²/s², world axes.
         step_covariance: (6, 6) of the motion from the last but one frame to the last, in the
             tangent of the last pose: rotation (rad), translation (m).
+        motions: of the body within frames, by their stamps, for rolling shutters.
     """
 
     stamps_ns: tuple[int, ...]
@@ -44,6 +47,7 @@ class EgoMotion:
     velocity_covariance: FloatArray
     rate_covariance: FloatArray
     step_covariance: FloatArray
+    motions: Mapping[int, FrameMotion] = field(default_factory=dict)
 
     @property
     def seconds(self) -> FloatArray:
@@ -131,6 +135,7 @@ class EgoWindow:
         self._length_ns = round(length_s * 1e9)
         self._poses: dict[int, gtsam.Pose3] = {}
         self._velocities: dict[int, FloatArray] = {}
+        self._motions: dict[int, FrameMotion] = {}
         self._frames: dict[int, int] = {}  # stamp of the frame with an index in the estimator
         self._started = False
 
@@ -144,6 +149,7 @@ class EgoWindow:
         """Forget all frames: the world is another one from now on."""
         self._poses.clear()
         self._velocities.clear()
+        self._motions.clear()
         self._frames.clear()
         self._started = False
 
@@ -163,9 +169,12 @@ class EgoWindow:
         self._frames[window.frame] = stamp_ns
         self._poses[stamp_ns] = state.world_T_body
         self._velocities[stamp_ns] = state.velocity
+        if estimator.motion is not None:
+            self._motions[stamp_ns] = estimator.motion
         for stamp in [s for s in self._poses if s < stamp_ns - self._length_ns]:
             del self._poses[stamp]
             del self._velocities[stamp]
+            self._motions.pop(stamp, None)
         self._frames = {i: s for i, s in self._frames.items() if s in self._poses}
         past = [i for i in window.past if i in self._frames and i != window.frame]
         for i in past:
@@ -176,7 +185,8 @@ class EgoWindow:
         velocity, rate, step = known or _by_state(state, stamps)
         velocities = np.array([self._velocities[stamp] for stamp in stamps])
         poses = tuple(self._poses.values())
-        return EgoMotion(stamps, poses, velocities, state, velocity, rate, step)
+        motions = dict(self._motions)
+        return EgoMotion(stamps, poses, velocities, state, velocity, rate, step, motions)
 
 
 def _known(

@@ -11,6 +11,7 @@ estimator finds one of the two and does not know of the other, so its covariance
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import cv2
 import gtsam
@@ -18,6 +19,8 @@ import numpy as np
 
 from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.backend.cost.feature_tracks import Observations, is_in
+from slam_graph.backend.cost.reprojection import Geometry
+from slam_graph.backend.objects.ego_motion import pose_arrays
 from slam_graph.backend.objects.track_assignment import MARGIN
 from slam_graph.backend.objects.track_window import TrackWindow, squared_errors
 
@@ -29,6 +32,9 @@ _LEAST_FRAMES = 3
 """Frames that must have seen a track."""
 _LEAST_POINTS = 4
 """Points that give a pose."""
+
+_Rays: TypeAlias = tuple[IntArray, FloatArray]
+"""Ids (N,), ascending, and normalised coordinates (N, 2)."""
 
 
 class MirrorMotion:
@@ -78,7 +84,7 @@ class MirrorMotion:
         for left in reversed(range(_ROUNDS)):
             cameras = [
                 _resected(pose, fit.ids, fit.points, *rays)
-                for pose, rays in zip(cameras, tracks.rays, strict=True)
+                for pose, rays in zip(cameras, self._rays(tracks, cameras, fit), strict=True)
             ]
             again = self._fit(tracks, cameras)
             if again.squares >= fit.squares:
@@ -90,12 +96,30 @@ class MirrorMotion:
 
     def _fit(self, tracks: _Tracks, cameras: list[gtsam.Pose3]) -> _Fit:
         """The points that the poses give, and how well they fit."""
-        camera_T_body = self._body_T_camera.inverse()
         obs = tracks.obs
-        found = self._window.triangulated(obs, [pose.compose(camera_T_body) for pose in cameras])
+        found = self._window.triangulated(obs, tracks.stamps_ns, self._of_body(cameras))
         finite = np.isfinite(found.points).all(axis=1)
         squares = squared_errors(obs, found, self._sigma_px)
         return _Fit(float(squares.sum()), obs.ids[finite], found.points[finite])
+
+    def _of_body(self, cameras: list[gtsam.Pose3]) -> list[gtsam.Pose3]:
+        """Poses of the body from those of the first camera."""
+        camera_T_body = self._body_T_camera.inverse()
+        return [pose.compose(camera_T_body) for pose in cameras]
+
+    def _rays(self, tracks: _Tracks, cameras: list[gtsam.Pose3], fit: _Fit) -> list[_Rays]:
+        """For each frame the features of the first camera, seen from one pose in all rows."""
+        poses = self._of_body(cameras)
+        still, moving = self._window.projection(), self._window.projection(tracks.stamps_ns, poses)
+        if still is moving:
+            return tracks.rays
+        obs = tracks.obs.subset(is_in(tracks.obs.ids, fit.ids))
+        obs = obs.rows(obs.camera == 0)
+        at = Geometry(*pose_arrays(tuple(poses[k] for k in obs.frames)), fit.points)
+        by_row = still.views(obs, at).normalized - moving.views(obs, at).normalized
+        rays, frame = obs.normalized + by_row, np.array(obs.frames)[obs.frame]
+        of_frames = [np.flatnonzero(frame == k) for k in range(len(cameras))]
+        return [(obs.ids[obs.feature[rows]], rays[rows]) for rows in of_frames]
 
     def _tracks(self, members: IntArray, stamps: list[int]) -> _Tracks:
         rays = []
@@ -104,7 +128,7 @@ class MirrorMotion:
                 seen = frame.cameras[0]
                 order = np.argsort(seen.ids)
                 rays.append((seen.ids[order], seen.normalized[order]))
-        return _Tracks(self._window.observations(members, _LEAST_FRAMES, stamps), rays)
+        return _Tracks(stamps, self._window.observations(members, _LEAST_FRAMES, stamps), rays)
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,12 +136,14 @@ class _Tracks:
     """Observations of an object, and for each frame the features of the first camera.
 
     Attributes:
+        stamps_ns: of the frames.
         obs: of its tracks, in all cameras.
         rays: ids (N,), ascending, and normalised coordinates (N, 2) for each frame.
     """
 
+    stamps_ns: list[int]
     obs: Observations
-    rays: list[tuple[IntArray, FloatArray]]
+    rays: list[_Rays]
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,7 +11,7 @@ tracks fit is that of an object, and the rest is searched again.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -19,7 +19,9 @@ import numpy as np
 from scipy.spatial.distance import cdist
 
 from slam_graph.arrays import BoolArray, FloatArray, IntArray
+from slam_graph.backend.cost.row_unrolling import unrolled
 from slam_graph.backend.cost.triangulation import triangulate_frames
+from slam_graph.backend.solve.state import FrameMotion
 from slam_graph.sensors import FeatureFrame, Rig
 
 _SAMPLE = 7
@@ -91,7 +93,12 @@ class _Tracks:
 
 
 def rigid_groups(
-    ids: IntArray, frames: Sequence[FeatureFrame], rig: Rig, min_points: int, sigma_px: float
+    ids: IntArray,
+    frames: Sequence[FeatureFrame],
+    rig: Rig,
+    min_points: int,
+    sigma_px: float,
+    motions: Mapping[int, FrameMotion] | None = None,
 ) -> list[IntArray]:
     """Groups of tracks that move rigidly, the largest first.
 
@@ -101,6 +108,7 @@ def rigid_groups(
         rig: its first camera is looked through.
         min_points: fewest tracks of a group.
         sigma_px: standard deviation of the observations.
+        motions: of the platform within frames, by their stamps; for rolling shutters.
 
     Returns:
         Their ids, ascending.
@@ -108,7 +116,7 @@ def rigid_groups(
     groups: list[IntArray] = []
     rest = ids
     for frame in list(frames)[:-1]:
-        tracks = _tracks(rest, frame, frames[-1], rig, sigma_px)
+        tracks = _tracks(rest, (frame, frames[-1]), rig, sigma_px, motions or {})
         while len(tracks.ids) >= min_points and len(groups) < _MAX_GROUPS:
             fits = _largest(tracks, min_points)
             if fits is None:
@@ -139,21 +147,29 @@ def _largest(tracks: _Tracks, min_points: int) -> BoolArray | None:
 
 
 def _tracks(
-    ids: IntArray, before: FeatureFrame, now: FeatureFrame, rig: Rig, sigma_px: float
+    ids: IntArray,
+    frames: tuple[FeatureFrame, FeatureFrame],
+    rig: Rig,
+    sigma_px: float,
+    motions: Mapping[int, FrameMotion],
 ) -> _Tracks:
     """The tracks with a depth in an earlier frame that are seen now."""
+    before, now = frames
+    moving = {0: motions[before.stamp_ns]} if before.stamp_ns in motions else {}
     mounted, seen = rig.cameras[0], now.cameras[0]
     focal_px = float(np.sqrt(mounted.camera.fx * mounted.camera.fy))
     ids = ids[np.isin(ids, seen.ids) & np.isin(ids, before.cameras[0].ids)]
     if len(ids) == 0 or len(rig.cameras) < 2:
         none = np.zeros(0)
         return _Tracks(ids[:0], none.reshape(0, 3), none, none.reshape(0, 2), 1.0)
-    found = triangulate_frames(ids, [before.only(ids)], np.eye(3)[None], np.zeros((1, 3)), rig)
+    origin = np.eye(3)[None], np.zeros((1, 3))
+    found = triangulate_frames(ids, [before.only(ids)], *origin, rig, moving)
     relative = found.depth_error * sigma_px / focal_px
     good = found.good & (relative < _MAX_DEPTH_ERROR)
     ids = ids[good]
     points = np.asarray(mounted.body_T_camera.transformTo(found.points[good].T)).T.reshape(-1, 3)
     order = np.argsort(seen.ids)
-    rays = seen.normalized[order][np.searchsorted(seen.ids[order], ids)]
+    rows = order[np.searchsorted(seen.ids[order], ids)]
+    rays = unrolled(seen, rows, rig, motions.get(now.stamp_ns), points[:, 2])
     sigma = 2.0 * sigma_px / focal_px  # that of where the point was seen before counts, too
     return _Tracks(ids, points, relative[good], rays, sigma)

@@ -209,7 +209,7 @@ def _fit(
     """Position now and velocity (J, 3), its covariance (J, 3, 3), squared errors (J,) over σ²."""
     J, N = len(obs.ids), len(obs)
     alone = replace(obs, feature=np.arange(N))  # every observation has a point of its own
-    since, reach = seconds[obs.frame], float(-seconds.min())
+    since, reach = seconds[obs.frame] + rig.row_times_s(obs), float(-seconds.min())
     x = np.hstack([points, np.zeros((J, 3 + _NUISANCES))])
     prior = obs.starts, x.copy(), _PRIOR_SIGMAS**-2.0
     shares = _shares(obs, since) / sigma_px

@@ -23,6 +23,7 @@ from scipy.special import chdtri
 from slam_graph.arrays import BoolArray, FloatArray, IntArray
 from slam_graph.backend.backend_config import BackendConfig
 from slam_graph.backend.cost.feature_tracks import Observations
+from slam_graph.backend.cost.row_unrolling import unrolled
 from slam_graph.backend.objects.ego_motion import EgoMotion
 from slam_graph.backend.objects.motion_test import MotionTest, Verdict, judge_tracks
 from slam_graph.backend.objects.object_frame import ObjectDirection, ObjectFrame
@@ -60,9 +61,9 @@ class DirectionTracker:
 
     def add(self, frame: FeatureFrame, ego: EgoMotion, sigma_px: float) -> ObjectFrame:
         """Take the features of one frame; arguments as for `ObjectTracker.add`."""
-        self._window.add(frame, ego.stamps_ns[0])
+        self._window.add(frame, ego.stamps_ns[0], ego)
         obs = self._window.observations(self._window.seen, _LEAST_FRAMES, list(ego.stamps_ns))
-        rig = self._window.projection
+        rig = self._window.projection(ego.stamps_ns, ego.poses)
         test = judge_tracks(obs, rig, ego, sigma_px, self._backend, self._config)
         moving = test.ids[np.isin(test.verdicts, (Verdict.MOVING, Verdict.WRONG))]
         moving = moving[self._not_static(moving, test, obs, ego, sigma_px)]
@@ -125,14 +126,17 @@ class DirectionTracker:
         before = recent[0]
         ids = ids[np.isin(ids, before.cameras[0].ids) & np.isin(ids, now.cameras[0].ids)]
         start, end = (self._towards(frame, ids, poses[frame.stamp_ns]) for frame in (before, now))
-        pixels = self._window.pixels(ids)
+        _, pixels = self._window.pixels(ids)
         return _Sights(ids, pixels, start, end, max((now.stamp_ns - before.stamp_ns) * 1e-9, 1e-3))
 
     def _towards(self, frame: FeatureFrame, ids: IntArray, pose: gtsam.Pose3) -> FloatArray:
         """Unit vectors (N, 3) in the world from the camera to features (ascending ids)."""
         seen = frame.cameras[0]
+        motion = self._window.motions.get(frame.stamp_ns)
         order = np.argsort(seen.ids)
-        rays = seen.normalized[order][np.searchsorted(seen.ids[order], ids)]
+        rows = order[np.searchsorted(seen.ids[order], ids)]
+        far = np.full(len(ids), np.inf)  # nobody knows how far
+        rays = unrolled(seen, rows, self._window.rig, motion, far)
         rays = np.column_stack([rays, np.ones(len(ids))])
         rays /= np.linalg.norm(rays, axis=1, keepdims=True)
         return np.asarray(rays @ (pose.rotation().matrix() @ self._body_R_camera).T)

@@ -144,7 +144,10 @@ class ObjectReview:
             most: squared errors of both above which they are not told apart. Tracks do not go over
                 where the errors are above that by more than what a motion takes.
         """
-        first = _one_side(self._window.pixels(members))
+        members, pixels = self._window.pixels(members)
+        if len(members) < 2 * least:
+            return []
+        first = _one_side(pixels)
         halves: list[Part] = []
         for _ in range(1 + _ROUNDS):
             parts = [members[first], members[~first]]

@@ -106,7 +106,7 @@ class ObjectTracker:
         """
         noise = self._backend.noise.model_copy(update={"pixel_sigma": noise_px})
         self._policies = self._policies[0], self._backend.model_copy(update={"noise": noise})
-        self._window.add(frame, ego.stamps_ns[0])
+        self._window.add(frame, ego.stamps_ns[0], ego)
         self._labels = TrackLabels(frame)
         states = self._follow(ego, noise_px)
         own = members_of(self.objects)
@@ -170,7 +170,7 @@ class ObjectTracker:
             return np.zeros(0, np.int64)
         stamps = list(world.stamps_ns)
         obs = self._window.observations(item.members, _LEAST_FRAMES, stamps)
-        rig, backend = self._window.projection, self._policies[1]
+        rig, backend = self._window.projection(stamps, world.poses), self._policies[1]
         test = judge_tracks(obs, rig, world, sigma_px, backend, self._config)
         return test.ids[test.moves]
 
@@ -255,9 +255,8 @@ class ObjectTracker:
     def _tested(self, ids: IntArray, ego: EgoMotion, sigma_px: float) -> MotionTest:
         stamps = list(ego.stamps_ns)
         obs = self._window.observations(ids, _LEAST_FRAMES, stamps)
-        return judge_tracks(
-            obs, self._window.projection, ego, sigma_px, self._policies[1], self._config
-        )
+        rig = self._window.projection(stamps, ego.poses)
+        return judge_tracks(obs, rig, ego, sigma_px, self._policies[1], self._config)
 
     def _begin(self, test: MotionTest, ego: EgoMotion, sigma_px: float) -> None:
         """Tracks that move together begin an object."""
@@ -296,8 +295,9 @@ class ObjectTracker:
         config = self._config
         if len(ids) < config.min_points or len(self._window.frames) < _LEAST_FRAMES:
             return []
-        frames = list(self._window.frames)
-        return rigid_groups(ids, frames, self._rig, config.min_points, sigma_px)
+        window = self._window
+        frames, motions = list(window.frames), window.motions
+        return rigid_groups(ids, frames, self._rig, config.min_points, sigma_px, motions)
 
     def _recognise(self, item: TrackedObject, ego: EgoMotion) -> None:
         """Give an object its old number if one that was hidden is expected there."""

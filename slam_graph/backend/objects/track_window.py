@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import gtsam
 import numpy as np
@@ -15,7 +15,9 @@ from slam_graph.backend.backend_config import BackendConfig
 from slam_graph.backend.cost.feature_tracks import FeatureTracks, Observations, is_in
 from slam_graph.backend.cost.reprojection import RigProjection
 from slam_graph.backend.cost.triangulation import Triangulation, triangulate
-from slam_graph.backend.objects.ego_motion import pose_arrays
+from slam_graph.backend.objects.ego_motion import EgoMotion, pose_arrays
+from slam_graph.backend.objects.row_motions import row_motions
+from slam_graph.backend.solve.state import FrameMotion
 from slam_graph.sensors import FeatureFrame, Rig
 
 _SPACING_S = 0.08
@@ -33,7 +35,8 @@ class TrackWindow:
 
     def __init__(self, rig: Rig, backend: BackendConfig) -> None:
         self.rig = rig
-        self.projection = RigProjection(rig)
+        self._projection = RigProjection(rig)
+        self._ego: EgoMotion | None = None
         self.frames: deque[FeatureFrame] = deque()
         self._backend = backend
         self._tracks = FeatureTracks()
@@ -51,8 +54,15 @@ class TrackWindow:
         """Ids (N,) of all features that the last frame saw, ascending."""
         return self._tracks.seen
 
-    def add(self, frame: FeatureFrame, since_ns: int) -> None:
-        """Add a frame; forget those before a time, and the last one if it is near to the others."""
+    def add(self, frame: FeatureFrame, since_ns: int, ego: EgoMotion | None = None) -> None:
+        """Add a frame; forget those before a time, and the last one if it is near to the others.
+
+        Args:
+            frame: its features.
+            since_ns: the time.
+            ego: the motion of the platform, which counts for rolling shutters only.
+        """
+        self._ego = ego
         self._tracks.add(self._count, frame)
         self._known.clear()
         self.frames.append(frame)
@@ -68,11 +78,39 @@ class TrackWindow:
             self._numbers.popleft()
         self._tracks.keep_frames(list(self._numbers))
 
-    def pixels(self, ids: IntArray) -> FloatArray:
-        """(N, 2) where the first camera sees features (ascending ids) of the last frame."""
-        seen = self.frames[-1].cameras[0]
-        order = np.argsort(seen.ids)
-        return np.asarray(seen.pixels[order][np.searchsorted(seen.ids[order], ids)])
+    def projection(
+        self, stamps_ns: Sequence[int] = (), poses: Sequence[gtsam.Pose3] = ()
+    ) -> RigProjection:
+        """The cameras; rows of rolling shutters are exposed while the platform moves.
+
+        Args:
+            stamps_ns: of frames; observations have their numbers.
+            poses: of the platform in each, in the world or in the frame of an object.
+        """
+        if self._ego is None or not self._projection.rolling:
+            return self._projection
+        return self._projection.moving(row_motions(self._ego, stamps_ns, poses))
+
+    @property
+    def motions(self) -> Mapping[int, FrameMotion]:
+        """Of the platform within frames, by their stamps; none with global shutters."""
+        return {} if self._ego is None else self._ego.motions
+
+    def pixels(self, ids: IntArray) -> tuple[IntArray, FloatArray]:
+        """Those of some features that the last frame saw, and where its first camera did.
+
+        Args:
+            ids: of the features, ascending.
+
+        Returns:
+            Their ids (N,), ascending, and pixels (N, 2): of the next camera where the first one
+            did not see them.
+        """
+        cameras = self.frames[-1].cameras
+        seen, rows = np.unique(np.concatenate([c.ids for c in cameras]), return_index=True)
+        wanted = is_in(seen, ids)
+        pixels = np.concatenate([c.pixels for c in cameras])
+        return seen[wanted], pixels[rows[wanted]]
 
     def observations(self, ids: IntArray, least: int, stamps_ns: list[int]) -> Observations:
         """Observations in some frames of the features (ascending ids) that enough of them saw.
@@ -121,22 +159,25 @@ class TrackWindow:
         """
         stamps = [stamp for stamp in self.stamps_ns if stamp in poses]
         obs = self.observations(ids, least, stamps)
-        found = self.triangulated(obs, [poses[stamp] for stamp in stamps])
+        found = self.triangulated(obs, stamps, [poses[stamp] for stamp in stamps])
         return obs.ids, squared_errors(obs, found, sigma_px), 2 * obs.counts - 3
 
-    def triangulated(self, obs: Observations, poses: Sequence[gtsam.Pose3]) -> Triangulation:
+    def triangulated(
+        self, obs: Observations, stamps_ns: Sequence[int], poses: Sequence[gtsam.Pose3]
+    ) -> Triangulation:
         """Some of the observations as static points of a world.
 
         Args:
             obs: as `observations` gives them.
-            poses: world_T_body in the frames that were asked for there.
+            stamps_ns: of the frames that were asked for there.
+            poses: world_T_body in each.
         """
         if len(obs) == 0:
             none = np.zeros(0)
             return Triangulation(none.reshape(0, 3), none.astype(np.bool_), none, none)
         rotations, positions = pose_arrays(tuple(poses[row] for row in obs.frames))
-        config = self._backend.triangulation
-        return triangulate(obs, self.projection, rotations, positions, config)
+        rig, config = self.projection(stamps_ns, poses), self._backend.triangulation
+        return triangulate(obs, rig, rotations, positions, config)
 
 
 def squared_errors(obs: Observations, found: Triangulation, sigma_px: float) -> FloatArray:
