@@ -21,7 +21,9 @@ from slam_graph.cli.main import app
 from slam_graph.config import load_config
 from slam_graph.datasets.calibration.kalibr_calibration import read_kalibr, write_kalibr
 from slam_graph.errors import ConfigError
+from slam_graph.evaluation import ape
 from slam_graph.geometry.trajectory import NavState
+from slam_graph.pipeline import run
 from slam_graph.sensors.measurements import (
     FeatureFrame,
     FeatureObservations,
@@ -242,3 +244,14 @@ def test_the_smoothers_of_gtsam_refuse_in_one_line() -> None:
     with pytest.raises(ConfigError, match=r"^backend\.calibration .* use msckf") as refusal:
         Estimator(simulate(SimulationConfig(duration_s=1.0)).rig, smoother, config)
     assert "\n" not in str(refusal.value)
+
+
+def test_a_right_calibration_that_is_estimated_costs_little() -> None:
+    """Depths are as uncertain as the mountings: no feature enters before they are known."""
+    flight_ = simulate(trajectory="random", duration_s=4.0, seed=2, cameras=2)
+    result = run(
+        flight_, overrides=["backend.calibration.extrinsics=true"], final_ba={"enabled": False}
+    )
+    result.check()
+    assert ape(flight_.groundtruth(), result.trajectory, alignment="none").statistics.rmse < 0.02
+    assert result.metrics["nees"]["position"]["mean"] < 8.0

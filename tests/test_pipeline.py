@@ -155,6 +155,7 @@ def state(**changes: Any) -> NavState:
         ({"covariance": np.diag(np.full(15, np.inf))}, "not finite"),
         ({"velocity": np.array([0, 101.0, 0])}, "speed of 101 m/s"),
         ({"covariance": np.eye(15) * 1e6}, "position sigma of 1e\\+03 m"),
+        ({"covariance": np.eye(15) * 9.0}, "orientation sigma of 3 rad"),
         ({"gyro_bias": np.array([0, 0, -3.0])}, "gyroscope bias of 3"),
         ({"accel_bias": np.array([0, 11.0, 0])}, "accelerometer bias of 11"),
     ],

@@ -64,6 +64,11 @@ class CalibrationVariables:
         self.rolling = nominal.rolling or config.readout
         self.keys = tuple(self._keys())
 
+    @property
+    def extrinsics(self) -> tuple[int, ...]:
+        """Keys of the mountings, camera by camera, as far as they are variables."""
+        return tuple(key for key in self.keys if letter_and_index(key)[0] == "e")
+
     def _keys(self) -> Iterator[int]:
         for c, mounted in enumerate(self.nominal.cameras):
             if self.config.extrinsics:

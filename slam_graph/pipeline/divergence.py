@@ -70,8 +70,8 @@ def check_sane(state: NavState, config: RunConfig) -> None:
     sigma_rad, sigma_m = (math.sqrt(max(*v, 0.0)) for v in (variances[:3], variances[3:6]))
     for what, value, limit in (
         ("speed of {} m/s", math.hypot(*velocity), limits.max_speed),
-        ("orientation sigma of {} rad", sigma_rad, limits.max_orientation_sigma_rad),
         ("position sigma of {} m", sigma_m, limits.max_position_sigma_m),
+        ("orientation sigma of {} rad", sigma_rad, limits.max_orientation_sigma_rad),
         ("gyroscope bias of {} rad/s", max(map(abs, gyro)), limits.max_gyro_bias),
         ("accelerometer bias of {} m/s²", max(map(abs, accel)), limits.max_accel_bias),
     ):

@@ -128,7 +128,7 @@ class Aiding:
         if not self._path.states:
             self._forget_before(data)
         self._data = AidingData.concatenate([self._data, data])
-        self.odometry.data = self._data
+        self.odometry.take(self._data)
         self._waiting = AidingData.concatenate([self._waiting, self._shifted(data)])
 
     def _forget_before(self, data: AidingData) -> None:
@@ -163,7 +163,8 @@ class Aiding:
             known: (6, 6) covariance of the new pose as it is predicted; None if it is not known.
             prior: on the variables up to the last frame, if lever arm or clock are among them.
         """
-        self._data = self.odometry.data = self._data.within(stamps_ns[0] - _RECEIVED_NS, None)
+        self._data = self._data.within(stamps_ns[0] - _RECEIVED_NS, None)
+        self.odometry.take(self._data)
         first, last = (state.frames.atPose3(pose_key(i)) for i in frames)
         speed = float(np.linalg.norm(state.frames.atVector(V(frames[0]))))
         factors = self.odometry.factors(frames, stamps_ns, speed)

@@ -51,15 +51,16 @@ def odometry_factor(
 
 
 class OdometryFactors:
-    """Makes factors of the odometry from frame to frame.
-
-    Attributes:
-        data: what was received of the last seconds.
-    """
+    """Makes factors of the odometry from frame to frame."""
 
     def __init__(self, config: OdometryConfig) -> None:
-        self._config, self.data = config, AidingData.empty()
+        self._config, self._data = config, AidingData.empty()
         self._came, self._asked, self._used = False, False, False
+
+    def take(self, data: AidingData) -> None:
+        """Take what was received of the last seconds, in the place of what was taken before."""
+        self._data = data
+        self._came |= len(data.odometry_stamps_ns) > 0
 
     @property
     def is_unused(self) -> bool:
@@ -68,7 +69,7 @@ class OdometryFactors:
 
     def between(self, from_ns: int, to_ns: int) -> tuple[FloatArray, FloatArray] | None:
         """As `AidingData.odometry_between`; None where odometry is not to be used."""
-        return self.data.odometry_between(from_ns, to_ns) if self._config.enabled else None
+        return self._data.odometry_between(from_ns, to_ns) if self._config.enabled else None
 
     def factors(
         self, frames: tuple[int, int], stamps_ns: tuple[int, int], speed: float
@@ -81,7 +82,6 @@ class OdometryFactors:
             speed: at the earlier one, as it is estimated, m/s.
         """
         moved = self.between(*stamps_ns)
-        self._came |= len(self.data.odometry_stamps_ns) > 0
         self._asked |= self._config.enabled
         if moved is None:
             return []

@@ -25,7 +25,7 @@ from slam_graph.arrays import FloatArray, skew
 from slam_graph.backend.cost.feature_tracks import Observations
 from slam_graph.backend.cost.reprojection import Geometry, RigProjection
 from slam_graph.backend.online_calibration import CalibrationVariables
-from slam_graph.backend.solve.square_root import Layout
+from slam_graph.backend.solve.square_root import Layout, SquareRootInformation
 from slam_graph.backend.solve.state import (
     FrameMotion,
     State,
@@ -78,6 +78,18 @@ class CalibratedProjection(RigProjection):
         """The projection with the calibration of a state, and the motions of its frames."""
         now = CalibratedProjection(self.variables, state)
         return now.with_velocities(state, self.velocities.first)
+
+    def turn_sigma_rad(self, prior: SquareRootInformation) -> float:
+        """See `RigProjection`."""
+        keys = self.variables.extrinsics
+        if len(keys) < 2:
+            return 0.0
+        root = prior.columns_of_root(keys).reshape(-1, len(keys), 6)[:, :, :3]
+        first = self.body_R_camera[0]
+        turns = [
+            root[:, c] - root[:, 0] @ first.T @ self.body_R_camera[c] for c in range(1, len(keys))
+        ]
+        return float(np.sqrt(max(np.sum(turn**2, axis=0).max() for turn in turns)))
 
     def moving(self, motions: Mapping[int, FrameMotion]) -> RigProjection:
         """The projection with the calibration as it is now, and the motions of frames."""

@@ -32,6 +32,7 @@ from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.backend.cost.feature_tracks import Observations
 from slam_graph.backend.cost.row_velocities import RowVelocities, follow_estimates
 from slam_graph.backend.online_calibration import GRAVITY
+from slam_graph.backend.solve.square_root import SquareRootInformation
 from slam_graph.backend.solve.stacked_values import stacked_poses
 from slam_graph.backend.solve.state import FrameMotion, State
 from slam_graph.kernels.projection import (
@@ -101,6 +102,14 @@ class RigProjection:
 
     calibration_keys: tuple[int, ...] = ()
     velocities = RowVelocities()
+
+    def turn_sigma_rad(self, prior: SquareRootInformation) -> float:
+        """Largest standard deviation of the rotation from the first camera to another one.
+
+        Args:
+            prior: on the variables of the window.
+        """
+        return 0.0
 
     def __init__(
         self,
