@@ -307,11 +307,11 @@ def test_commands_leave_out_the_imu(tmp_path: Path) -> None:
 def test_what_a_recording_loses_by_another_calibration_is_said(tmp_path: Path) -> None:
     folder = tmp_path / "flight"
     simulate(duration_s=1.0, cameras=1, depth={"sensor": "kinect"}).save(folder)
-    assert open_dataset(folder).has_depth
+    assert open_dataset(folder).info().has_depth
     chain = read_kalibr(folder / "calibration.yaml")
     (tmp_path / "plain.yaml").write_text(kalibr_text(replace(chain, depth=None)))
     plain = open_dataset(folder, calibration=tmp_path / "plain.yaml")
-    assert not plain.has_depth
+    assert not plain.info().has_depth
     assert plain.diagnostics.counts == {"depth_left_out": 1}
     turned = replace(chain.cameras[0], rotation_known=False)
     (tmp_path / "unknown.yaml").write_text(kalibr_text(replace(chain, cameras=(turned,))))
