@@ -209,12 +209,11 @@ class CostConstruction:
         """The features of the state, ascending, that are measured in the current frame.
 
         Where an estimate is far from its linearisation point, the Jacobian there is wrong and would
-        turn the platform. Such features leave the state, and their tracks start anew. Lost features
-        that are kept for when they are seen again would come back at once, and go on.
+        turn the platform. Such features leave the state, and their tracks start anew.
         """
         waiting = window.tracks.ids_waiting()
         ids: IntArray = window.state_features[is_in(window.state_features, waiting)]
-        if self.policy.keep_lost_features or not len(ids):
+        if not len(ids):
             return ids
         points, first = state.both_positions_of(ids)
         (R,), (p,) = state.poses([window.frame])
