@@ -6,7 +6,8 @@ import gtsam
 import numpy as np
 import pytest
 
-from slam_graph.backend.backend_config import BackendConfig
+from slam_graph.backend.aiding.odometry_factors import odometry_factor
+from slam_graph.backend.backend_config import BackendConfig, OdometryConfig
 from slam_graph.backend.estimator import Estimator
 from slam_graph.backend.initialization.odometry_scale import in_metres
 from slam_graph.backend.initialization.start_diagnosis import Refusal
@@ -114,3 +115,36 @@ def test_two_views_get_the_unit_of_the_odometry_whatever_the_place_of_the_camera
         assert found[0].between(a).equals(true[0].between(b), 1e-9)
     still = [(turn, 0.0 * shift) for turn, shift in motions]
     assert isinstance(in_metres([true[0]] * len(true), still, context), Refusal)
+
+
+@pytest.mark.parametrize("case", ["part", "late", "elsewhere"])
+def test_a_start_takes_what_the_odometry_covers(case: str) -> None:
+    """A part of a recording, odometry that begins later than the images, and on another clock."""
+    sequence = _flight(6.0)
+    whole, first_s = sequence.aiding, 2.5 if case == "late" else 0.0
+    shift_ns = 10**12 if case == "elsewhere" else 0
+    kept = whole.odometry_stamps_ns >= whole.odometry_stamps_ns[0] + round(first_s * 1e9)
+    sequence.aiding = whole.with_odometry(
+        whole.odometry_stamps_ns[kept] + shift_ns,
+        whole.odometry_positions[kept],
+        whole.odometry_quaternions[kept],
+    )
+    start_s = 1.0 if case == "part" else 0.0
+    result = run(
+        sequence,
+        start_s=start_s,
+        duration_s=4.5,
+        min_coverage=0.2,
+        final_ba={"enabled": False},
+    )
+    result.check()
+    unused = case == "elsewhere"
+    assert result.warnings["odometry_unused"] == result.warnings["scale_unknown"] == unused
+    assert unused or abs(_scale(sequence, result) - 1.0) < 0.06
+
+
+def test_a_way_that_was_not_expected_has_the_noise_of_its_length() -> None:
+    moved = np.zeros(3), np.array([5.0, 0.0, 0.0])
+    factor = odometry_factor((0, 1), moved, 0.0, OdometryConfig())
+    assert isinstance(factor, gtsam.NoiseModelFactor)
+    assert factor.noiseModel().sigmas()[3] > 0.02 * np.sqrt(5.0)

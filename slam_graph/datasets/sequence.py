@@ -33,7 +33,7 @@ from slam_graph.geometry import NavState, Trajectory
 from slam_graph.sensors import AidingData, CameraFrame, FeatureFrame, ImuData, Packet, Rig
 
 _HISTORY_NS = 1_000_000_000
-"""How much of the IMU before a chosen start the first packet carries."""
+"""How much of the IMU and the odometry before a chosen start the first packet carries."""
 _ASSUMED_MOUNTING = (
     "where the cameras are mounted is unknown and no IMU tells it: the body is taken for the first "
     "camera, and lever arms, odometry and known poses are taken to be given in its frame"
@@ -337,7 +337,17 @@ class RecordedSequence(ObjectSources, Displayed, ABC):
                 None if start_ns is None else _HISTORY_NS,
                 round(rig.end_offset_s * 1e9),
             )
-        return with_aiding(packets, self.aiding.within(begin_ns, None), rig)
+        return with_aiding(packets, self._aiding_from(begin_ns), rig)
+
+    def _aiding_from(self, begin_ns: int | None) -> AidingData:
+        """What follows a time, with the odometry that leads up to it, as it is interpolated."""
+        later = self.aiding.within(begin_ns, None)
+        if begin_ns is None:
+            return later
+        led = self.aiding.within(begin_ns - _HISTORY_NS, None)
+        return later.with_odometry(
+            led.odometry_stamps_ns, led.odometry_positions, led.odometry_quaternions
+        )
 
     @cached_property
     def aiding(self) -> AidingData:

@@ -78,7 +78,8 @@ class ClockWatch:
         losses = self._result.segments.losses
         for begin_ns, _ in losses[self._losses :]:
             self._frames, self._samples = [], []
-            self._windows.forget_after(begin_ns - self._result.input.offset_ns)
+            offset_ns = round(self._result.causal_rig.pose_offset_s * 1e9)
+            self._windows.forget_after(begin_ns - offset_ns)
         self._losses = len(losses)
 
     def _close(self) -> None:

@@ -33,7 +33,7 @@ _TRUTH_SIGMAS = (0.01, 0.01, 0.05, 0.05, 0.01)
 _UNKNOWN_BIAS_SIGMAS = (0.2, 0.1)
 """Standard deviations of the accelerometer and gyroscope bias where the truth has none."""
 
-_ODOMETRY_UNUSED = (
+ODOMETRY_UNUSED = (
     "the odometry reaches from no frame to the next one: it is on another clock, or its samples "
     "are more than 0.5 s apart"
 )
@@ -215,7 +215,7 @@ class Estimation:
             self._take_last()
         self._result.logs.by_frame.note_times(self.estimator.times_ns)
         if self.estimator.aiding.odometry.is_unused:
-            self._diagnostics.warn("odometry_unused", _ODOMETRY_UNUSED)
+            self._diagnostics.warn("odometry_unused", ODOMETRY_UNUSED)
 
     def _take_last(self) -> None:
         """Note what the frames that still wait lead to."""

@@ -18,7 +18,7 @@ from slam_graph.datasets import RecordedSequence, Sequence, open_dataset
 from slam_graph.errors import DataError
 from slam_graph.frontend import build_frontend
 from slam_graph.interrupts import Interrupts
-from slam_graph.pipeline.estimation import Estimation
+from slam_graph.pipeline.estimation import ODOMETRY_UNUSED, Estimation
 from slam_graph.pipeline.observers import (
     GraphKeeping,
     NullProgress,
@@ -49,6 +49,9 @@ _NO_SCALE = (
     "one camera without an IMU or odometry: all lengths are up to scale; "
     "fixes and known poses are not used"
 )
+
+_LEAST_ODOMETRY_S = 1.0
+"""Odometry of less time is not waited for, where it would tell the unit of length."""
 
 
 def run(
@@ -97,6 +100,8 @@ def run(
     result.history.level, result.history.scaled_camera = rig.has_imu, rig.scaled_camera
     if not rig.has_scale:
         sequence.diagnostics.warn("scale_unknown", _NO_SCALE)
+        if isinstance(sequence, RecordedSequence) and len(sequence.aiding.odometry_stamps_ns):
+            sequence.diagnostics.warn("odometry_unused", ODOMETRY_UNUSED)
     places = _place_stages(sequence, result, known_map)
     tracking = _tracking(sequence, result.input)
     estimation = Estimation(sequence, result)
@@ -209,9 +214,17 @@ def _part_of(sequence: Sequence, config: RunConfig) -> RunInput:
         objects = sequence.object_truth() if config.objects.enabled else {}
         aiding = config.backend.on_the_clock(sequence.aiding)
         of_fixes = is_in_world_of_fixes(truth, aiding, config.backend)
-        measured = config.backend.odometry.enabled and len(aiding.odometry_stamps_ns) > 0
-        rig = replace(rig, has_odometry=measured)
+        rig = replace(rig, has_odometry=_tells_lengths(sequence, config, start_ns, end_ns))
     return RunInput(info, config, rig, start_ns, end_ns, truth, datum, objects, of_fixes)
+
+
+def _tells_lengths(
+    sequence: RecordedSequence, config: RunConfig, start_ns: int, end_ns: int
+) -> bool:
+    """Whether odometry covers enough of a part, by the stamps of its first and last frame."""
+    offset_ns = round(sequence.rig.pose_offset_s * 1e9)
+    covered_s = sequence.aiding.odometry_covers_s(start_ns + offset_ns, end_ns + offset_ns)
+    return config.backend.odometry.enabled and covered_s >= _LEAST_ODOMETRY_S
 
 
 def _tracking(sequence: Sequence, asked: RunInput) -> Tracking:

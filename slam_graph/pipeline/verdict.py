@@ -330,13 +330,12 @@ class Verdict(Stage):
     @property
     def _losses(self) -> list[tuple[int, int]]:
         """Times in which the estimate was lost, on the clock of the frames."""
-        offset_ns = self._result.input.offset_ns
+        offset_ns = round(self._result.causal_rig.pose_offset_s * 1e9)
         return [(a - offset_ns, b - offset_ns) for a, b in self._result.segments.losses]
 
     def _final_rig(self) -> Rig:
         """The rig as calibrated, corrected or estimated, whichever came last."""
-        latest = self._result.logs.calibration.latest
-        return self._result.causal_rig if latest is None else latest.rig
+        return self._result.logs.calibration.rig(self._result.causal_rig)
 
     def _is_doubtful(self) -> bool:
         """Whether something shows that a good recording hardly ever shows."""

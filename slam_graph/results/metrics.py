@@ -119,18 +119,20 @@ def consistency_table(
         return {"unavailable": str(error)}
 
 
-def extent_table(asked: RunInput, frames: int, trajectory: Trajectory, segments: Segments) -> Table:
+def extent_table(
+    asked: RunInput, offset_ns: int, frames: int, trajectory: Trajectory, segments: Segments
+) -> Table:
     """How much was asked for, read and estimated.
 
     Args:
         asked: the part of a recording that was asked for.
+        offset_ns: time of a state since the stamp of its frame.
         frames: that were read.
         trajectory: that was estimated.
         segments: its stretches.
     """
     stamps = trajectory.stamps_ns
     started = len(stamps) > 0
-    first_ns, _ = asked.states_ns
     return {
         "start_ns": asked.start_ns,
         "end_ns": asked.end_ns,
@@ -139,7 +141,9 @@ def extent_table(asked: RunInput, frames: int, trajectory: Trajectory, segments:
         "estimated_frames": len(stamps),
         "estimated_s": segments.seconds,
         "coverage": coverage(asked.start_ns, asked.end_ns, segments),
-        "initialization_s": float(stamps[0] - first_ns) * 1e-9 if started else None,
+        "initialization_s": float(stamps[0] - asked.start_ns - offset_ns) * 1e-9
+        if started
+        else None,
     }
 
 

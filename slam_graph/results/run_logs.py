@@ -8,7 +8,7 @@ from array import array
 from bisect import bisect_left
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from operator import attrgetter
 from typing import Any, get_type_hints
 
@@ -146,8 +146,13 @@ class CalibrationLog:
         self.latest = self._estimates[-1] if kept else None
 
     def rig(self, given: Rig) -> Rig:
-        """The rig of the last estimate; without one that which was given."""
-        return given if self.latest is None else self.latest.rig
+        """A rig with the cameras of the last estimate; without one as it was given.
+
+        The estimator has one camera more where depth is measured.
+        """
+        if self.latest is None:
+            return given
+        return replace(given, cameras=self.latest.rig.cameras[: len(given.cameras)])
 
     def table(self) -> dict[str, dict[str, Any]] | None:
         """The last estimate: start, value and standard deviation of each parameter by its name."""

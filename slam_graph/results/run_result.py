@@ -253,7 +253,8 @@ class RunResult(RunSummary):
     def metrics(self) -> dict[str, Any]:
         """The content of `metrics.json`; computed when it is first asked for."""
         asked, logs, truth = self.input, self.logs, self.groundtruth
-        extent = tables.extent_table(asked, logs.frames, self.trajectory, self.segments)
+        offset_ns = round(self.causal_rig.pose_offset_s * 1e9)
+        extent = tables.extent_table(asked, offset_ns, logs.frames, self.trajectory, self.segments)
         frames = max(logs.frames, 1)
         located = self.localization
         table: dict[str, Any] = tables.finite(

@@ -206,6 +206,12 @@ class AidingData:
             pose_stamps_ns=self.pose_stamps_ns + poses_ns,
         )
 
+    def odometry_covers_s(self, from_ns: int, to_ns: int) -> float:
+        """How much of a time the odometry covers, s."""
+        stamps_ns = self.within(from_ns - 1, to_ns).odometry_stamps_ns
+        steps_s = np.diff(stamps_ns) * 1e-9
+        return float(np.sum(steps_s[steps_s <= _MAX_ODOMETRY_GAP_S]))
+
     def odometry_between(self, from_ns: int, to_ns: int) -> tuple[FloatArray, FloatArray] | None:
         """How the body moved by its odometry; None where that does not cover both times.
 

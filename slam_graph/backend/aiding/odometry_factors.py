@@ -13,6 +13,8 @@ from slam_graph.sensors import AidingData
 
 _LEAST_ROTATION_RAD, _LEAST_POSITION_M = 1e-4, 1e-3
 """Standard deviations of a motion of no length."""
+_UNEXPECTED = 5.0
+"""A way that is measured so many σ too long is not so by its noise."""
 
 
 def motion_sigmas(turn_rad: float, way_m: float, config: OdometryConfig) -> FloatArray:
@@ -39,11 +41,15 @@ def odometry_factor(
         moved: rotation vector (3,) and translation (3,) of the body, in its frame at the first.
         way_m: length of the way as it is estimated. It must not be that of the odometry: a
             measured way that is too long would count less than one that is too short, and lengths
-            would come out too small by σ² / way² (1 % where σ is a tenth of the way).
+            would come out too small by σ² / way² (1 % where σ is a tenth of the way). Only where
+            that is much longer it counts.
         config: noise; see `motion_sigmas`.
     """
     turn, shift = moved
-    sigmas = motion_sigmas(float(np.linalg.norm(turn)), way_m, config)
+    turn_rad, measured_m = float(np.linalg.norm(turn)), float(np.linalg.norm(shift))
+    sigmas = motion_sigmas(turn_rad, way_m, config)
+    if measured_m > way_m + _UNEXPECTED * sigmas[1]:  # it has set off
+        sigmas = motion_sigmas(turn_rad, measured_m, config)
     noise = gtsam.noiseModel.Diagonal.Sigmas(np.repeat(sigmas, 3))
     pose = gtsam.Pose3(gtsam.Rot3.Expmap(turn), shift)
     first, last = (gtsam.symbol("x", frame) for frame in frames)

@@ -82,6 +82,8 @@ class CalibratedProjection(RigProjection):
     def turn_sigma_rad(self, prior: SquareRootInformation) -> float:
         """See `RigProjection`."""
         keys = self.variables.extrinsics
+        if self._rig.depth is not None:
+            keys = keys[:-1]  # the last camera stands for the depth sensor
         if len(keys) < 2:
             return 0.0
         root = prior.columns_of_root(keys).reshape(-1, len(keys), 6)[:, :, :3]

@@ -162,10 +162,12 @@ class CostConstruction:
         predicted = cost.prior_at_estimate().updated(rows, overwrite=True, overwrite_rows=True)
         in_state = self._measured_again(window, cost.state)
         cost.landmarks = window.tracks.observations(in_state)
+        tracked = is_in(window.state_features, window.tracks.seen)
+        held = int(tracked.sum()) if self.policy.keep_lost_features else len(in_state)
         uses_images = not images_wait(window, cost.state, predicted)
         if uses_images:
             cost.tracks = self._selection.new_features(
-                window, cost.state, poses, len(in_state), self._dynamic, removals
+                window, cost.state, poses, held, self._dynamic, removals
             )
         offered = cost.tracks
         gate, linear = self._apply_gate(window, cost, predicted, removals)
@@ -209,7 +211,7 @@ class CostConstruction:
         """The features of the state, ascending, that are measured in the current frame.
 
         Where an estimate is far from its linearisation point, the Jacobian there is wrong and would
-        turn the platform. Such features leave the state, and their tracks start anew.
+        turn the platform. Such features leave, or stay unmeasured where lost features are kept.
         """
         waiting = window.tracks.ids_waiting()
         ids: IntArray = window.state_features[is_in(window.state_features, waiting)]

@@ -112,19 +112,31 @@ class MonocularStart:
         return moved(outcome, world_T_body.compose(there.inverse()))
 
     def _forget(self) -> None:
-        """Forget frames that are too old, or share too few features with the present one."""
+        """Forget frames that are too old, or share too few features with the present one.
+
+        Where odometry tells the unit of length, also those that it does not connect with that.
+        """
         latest = self._frames[-1].cameras[0].ids
         enough = max(MIN_POINTS, _SHARED * len(latest))
         while len(self._frames) > 1:
             shared = np.count_nonzero(np.isin(self._frames[0].cameras[0].ids, latest))
-            if shared >= enough and self._stamps_ns[-1] - self._stamps_ns[0] <= _LONGEST_NS:
+            recent = self._stamps_ns[-1] - self._stamps_ns[0] <= _LONGEST_NS
+            if shared >= enough and recent and self._is_measured():
                 return
             del self._stamps_ns[0], self._frames[0]
+
+    def _is_measured(self) -> bool:
+        """Whether odometry, if it tells the unit of length, leads from the first frame on."""
+        if not self._context.rig.has_odometry:
+            return True
+        ends = self._stamps_ns[0], self._stamps_ns[-1]
+        return motions_by_odometry(self._context, ends) is not None
 
     def _attempt(self) -> Window | Refusal:
         """A start from the frames so far, or what is missing for it."""
         if len(self._frames) < 3:
-            needs = f"frames that share {MIN_POINTS} features, and half of the present ones"
+            led = " and odometry" if self._context.rig.has_odometry else ""
+            needs = f"frames that share {MIN_POINTS} features{led}, and half of the present ones"
             return Refusal("tracks", needs)
         first, last = self._frames[0].cameras[0], self._frames[-1].cameras[0]
         ids, rows, others = np.intersect1d(first.ids, last.ids, return_indices=True)
