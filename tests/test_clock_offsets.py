@@ -109,6 +109,7 @@ def test_a_saved_run_says_the_same_of_keyframes_and_consistency(tmp_path: Path) 
     result.save(tmp_path / "out")
     saved = sg.load_result(tmp_path / "out")
     np.testing.assert_array_equal(saved.keyframes_ns, result.keyframes_ns)
+    assert saved._view().start_ns == result._view().start_ns == result.input.states_ns[0]
     assert saved.nees_series is not None
     assert result.nees_series is not None
     np.testing.assert_array_equal(saved.nees_series[0], result.trajectory.stamps_ns)

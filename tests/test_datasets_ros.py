@@ -68,18 +68,22 @@ def test_calibration_in_the_bag(tmp_path: Path) -> None:
     np.testing.assert_allclose(right.body_T_camera.translation(), [0.1, 0.1, 0], atol=1e-12)
 
 
+@pytest.mark.parametrize("transport", ["", "/compressed"])
 @pytest.mark.parametrize("kind", ["ros1", "sqlite"])
-def test_rectified_images_have_axes_of_their_own(tmp_path: Path, kind: str) -> None:
+def test_rectified_images_have_axes_of_their_own(tmp_path: Path, kind: str, transport: str) -> None:
     """A direction x along the axes of the camera is R x along those of rectified images."""
     R = gtsam.Rot3.Ypr(0.02, 0.09, -0.03).matrix()
+    topics = ("/cam0/image_raw", f"/left/image_rect{transport}")
 
     def extra(bag: BagWriter) -> None:
         image = np.zeros((SIZE[1], SIZE[0]), np.uint8)
-        bag.write("/left/image_rect", bag.image(START_NS, image, "mono8", "cam0"), START_NS)
+        message = bag.image(START_NS, image, "mono8", "cam0")
+        if transport:
+            message = bag.compressed(START_NS, encoded(image, ".png"), "png", "cam0")
+        bag.write(topics[1], message, START_NS)
         bag.write("/left/camera_info", bag.camera_info(START_NS, "cam0", R=R), START_NS)
 
     path = write_bag(tmp_path, kind, extra=extra)
-    topics = ("/cam0/image_raw", "/left/image_rect")
     raw, rectified = (open_dataset(path, sources={"cam0": t}).rig.cameras[0] for t in topics)
     expected = R @ raw.body_T_camera.rotation().matrix().T
     found = rectified.body_T_camera.rotation().matrix().T

@@ -2,8 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """Position fixes in Rerun: those of the recording, in their own world, as good as they say."""
 
+from collections import defaultdict
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import pytest
@@ -13,6 +17,7 @@ from scipy.spatial.transform import Rotation
 
 import slam_graph as sg
 from slam_graph.arrays import FloatArray
+from slam_graph.backend import BackendConfig, Estimator
 from slam_graph.datasets import Sequence
 from slam_graph.geometry import interpolate
 from slam_graph.results import RunResult
@@ -26,6 +31,7 @@ from slam_graph.visualization.rerun_fixes import (
     POSE_SIGMA,
     POSES,
     FixLog,
+    FixViews,
     KnownPoseLog,
 )
 from slam_graph.visualization.rerun_palette import ORANGE, VERMILLION
@@ -215,3 +221,32 @@ def test_axes_and_ellipsoids_of_known_poses_are_what_was_measured(tmp_path: Path
     unit = vectors / np.linalg.norm(vectors, axis=2, keepdims=True)
     np.testing.assert_allclose(unit, turns[both].as_matrix().transpose(0, 2, 1), atol=1e-6)
     assert {POSES, POSE_SIGMA, POSE_AXES} <= set(GROWING), "or the viewer shows the last one only"
+
+
+@pytest.mark.parametrize("estimated", [False, True])
+def test_fixes_are_shown_with_the_state_of_their_time(tmp_path: Path, estimated: bool) -> None:
+    """The state is 0.2 s later than the stamp of its frame; 0.1 s if the offset is estimated."""
+    plain = drive(1.0).rig
+    late = replace(plain.cameras[0], time_offset_s=0.2)
+    estimator = cast(
+        Estimator,
+        SimpleNamespace(
+            rig=replace(plain, cameras=(late,)),
+            solved_ns=10**9,
+            times_ns={10**9: 1_100_000_000} if estimated else {},
+            config=BackendConfig(),
+            aiding=SimpleNamespace(
+                gates=defaultdict(lambda: SimpleNamespace(tested=0, rejected=0))
+            ),
+        ),
+    )
+    stamps_ns = np.array([1_050_000_000, 1_150_000_000, 1_250_000_000])
+    data = AidingData.empty().with_poses(
+        stamps_ns, np.zeros((3, 3)), np.tile([0.0, 0.0, 0.0, 1.0], (3, 1)), np.ones((3, 6))
+    )
+    stream = RerunStream("save", "poses", tmp_path / "poses.rrd")
+    views = FixViews(stream)
+    views._take(data, estimator)
+    stream.close()
+    ((taken, _, _),) = views._taken
+    assert taken.pose_stamps_ns.tolist() == stamps_ns[: 1 if estimated else 2].tolist()

@@ -28,7 +28,7 @@ POINT_FRAMES = 10
 """Number of recent frames from which the points of a keyframe are triangulated …"""
 POINT_FRAME_SPACING_S = 0.1
 """… and the time between them: within a second the estimator hardly drifts."""
-_LAST_POSES = 3
+LAST_POSES = 3
 """Poses that tell how the body moves while a rolling shutter exposes a frame."""
 MAX_REPROJECTION_PX = 3.0
 """Points of a larger root-mean-square reprojection error are left out."""
@@ -152,7 +152,7 @@ class KeyframeLog:
         self._describer = KeyframeDescriber(camera, config.further_corners)
         self._focal_px = float(np.sqrt(camera.fx * camera.fy))
         self._recent: deque[PosedFrame] = deque(maxlen=POINT_FRAMES)
-        self._last: deque[tuple[int, gtsam.Pose3]] = deque(maxlen=_LAST_POSES)
+        self._last: deque[tuple[int, gtsam.Pose3]] = deque(maxlen=LAST_POSES)
 
     def add(
         self, frame: FeatureFrame, world_T_body: gtsam.Pose3, image: Image | None = None
@@ -199,7 +199,7 @@ class KeyframeLog:
         ]
         self._recent = deque((view.moved(motion) for view in self._recent), maxlen=POINT_FRAMES)
         last = ((stamp_ns, motion.compose(pose)) for stamp_ns, pose in self._last)
-        self._last = deque(last, maxlen=_LAST_POSES)
+        self._last = deque(last, maxlen=LAST_POSES)
 
     def at(self, trajectory: Trajectory) -> list[Keyframe]:
         """The keyframes at the poses of a trajectory; those outside of it keep their poses.

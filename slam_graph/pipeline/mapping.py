@@ -10,17 +10,20 @@ from __future__ import annotations
 
 import logging
 import time
+from collections import deque
 from dataclasses import replace
 
 import cv2
 import gtsam
 import numpy as np
 
+from slam_graph.backend import PosedFrame
 from slam_graph.datasets import Sequence
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import DataError
 from slam_graph.geometry import NavState, Trajectory
 from slam_graph.loop_closure import Keyframe, KeyframeLog, Loop, close_loops
+from slam_graph.loop_closure.loop_keyframes import LAST_POSES
 from slam_graph.maps import MapLocalizer, MapRecording, SlamMap, build_map
 from slam_graph.pipeline.stage import COMPLETED, EstimatedFrame, Stage, warn_on_failure
 from slam_graph.pose_graph import Poses
@@ -244,6 +247,7 @@ class Localization(Stage):
         self._localizer = MapLocalizer(known, rig, loops, config)
         self._name, self._diagnostics = result.input.info.name, diagnostics
         self._log = result.begin_localization(known)
+        self._last: deque[tuple[int, gtsam.Pose3]] = deque(maxlen=LAST_POSES)
 
     def frame(self, frame: EstimatedFrame) -> None:
         """Take a frame, if there is an estimate.
@@ -253,11 +257,13 @@ class Localization(Stage):
         """
         if frame.restarted:
             self._localizer.restart(self._result.causal_rig)
+            self._last.clear()
         state = frame.state
         if state is None or frame.waits:
             return
         began = time.perf_counter()
         localizer = self._localizer
+        self._last.append((state.stamp_ns, state.world_T_body))
         localizer.move(state.stamp_ns, state.world_T_body)
         if localizer.wants(state.stamp_ns):
             view = self._view(frame, state)
@@ -283,11 +289,14 @@ class Localization(Stage):
         if seen.descriptors is None or len(seen) == 0:
             return None
         unknown = np.full((len(seen), 3), np.nan)
+        rig = _rig_of(self._result)
+        features = FeatureFrame(state.stamp_ns, frame.features.cameras)
+        posed = PosedFrame.of(features, tuple(self._last), rig)
         return Keyframe(
             state.stamp_ns,
             state.world_T_body,
             seen.ids,
-            seen.normalized,
+            posed.unrolled(seen, unknown, rig),
             seen.descriptors,
             unknown,
         )

@@ -76,7 +76,7 @@ def confirmed_loops(graph: PoseGraph, along_odometry: Poses, bound: float) -> In
 
     Args:
         graph: the pose graph.
-        along_odometry: poses composed along consecutive edges.
+        along_odometry: poses composed along the odometry, as by `along_tree`.
         bound: largest χ² of a consistent cycle.
     """
     loops = np.flatnonzero(~graph.is_odometry)
@@ -134,8 +134,8 @@ class _Noise:
         axes = np.diagonal(covariance, axis1=1, axis2=2)
         variances = np.stack([axes[:, d:].mean(axis=1), axes[:, :d].mean(axis=1)])
         steps = np.full((2, len(graph.keys)), np.nan)
-        consecutive = graph.is_odometry
-        steps[:, graph.edges[consecutive].max(axis=1)] = variances[:, consecutive]
+        odometry = graph.is_odometry
+        steps[:, graph.edges[odometry].max(axis=1)] = variances[:, odometry]
         missing = np.isnan(steps[0])
         return _Noise(
             variances[:, loops], np.cumsum(np.nan_to_num(steps), axis=1), np.cumsum(missing)

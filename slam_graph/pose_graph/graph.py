@@ -122,6 +122,7 @@ class PoseGraph(Displayed):
             or to the vector part of the quaternion (g2o).
         name: of the graph.
         odometry: (M,) whether each edge is odometry; those between consecutive poses if not given.
+            Files do not carry it.
     """
 
     keys: IntArray

@@ -129,7 +129,7 @@ def initialize(graph: PoseGraph, how: Initialization, diagnostics: Diagnostics) 
         graph: the pose graph.
         how: chordal: relaxed rotations, projected on SO(d), then translations (Carlone, Tron,
             Daniilidis and Dellaert 2015). lago: angles first, in 2D (Carlone, Aragues, Castellanos
-            and Bona 2014). odometry: composed along a spanning tree that prefers consecutive poses.
+            and Bona 2014). odometry: composed along a spanning tree that prefers odometry.
             file: those of the file.
         diagnostics: counts if the method fails and odometry is used instead.
 
@@ -251,7 +251,7 @@ def _solved(
 
 
 def along_tree(graph: PoseGraph) -> Poses:
-    """Poses composed along a spanning tree that prefers edges between consecutive poses."""
+    """Poses composed along a spanning tree that prefers odometry."""
     poses = Poses.identity(len(graph.keys), graph.dimension)
     at_anchors = graph.anchor_poses()
     poses.rotations[graph.anchors] = at_anchors.rotations

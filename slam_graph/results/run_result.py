@@ -392,7 +392,7 @@ class RunResult(RunSummary):
         if self.final_ba is not None:
             histories[SMOOTHED] = self.final_ba.history
         estimates = {name: PoseEstimate.of_history(found) for name, found in histories.items()}
-        loops, truth, began_ns = self._paths_of_loops(), self.groundtruth, self.input.start_ns
+        loops, truth, began_ns = self._paths_of_loops(), self.groundtruth, self.input.states_ns[0]
         view = RunView(estimates, loops, truth, self.points, began_ns)
         view = with_covariances_after_alignment(
             view, histories, self.start_was_given, self.final_ba

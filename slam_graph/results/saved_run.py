@@ -271,7 +271,7 @@ class SavedRun(RunSummary):
             self._paths_of_loops(),
             self.groundtruth,
             self.points,
-            self.metrics["extent"]["start_ns"],
+            self.metrics["extent"]["start_ns"] + round(self.rig.pose_offset_s * 1e9),
         )
         if self.scaled_camera is not None and view.truth is not None:
             view = view.at_camera(self.scaled_camera)

@@ -30,7 +30,7 @@ def pose_graph_figure(
         title: of the picture.
         states: (N, 2 or 3) positions in metres, by the name of the state.
         edges: (M, 2) rows of the poses that each edge joins.
-        is_odometry: (M,) which edges join consecutive poses; the others close loops.
+        is_odometry: (M,) which edges are odometry; the others close loops.
         rejected: (M,) which edges the optimisation rejected; they are drawn in the first state.
     """
     rejected = np.zeros(len(edges), bool) if rejected is None else rejected

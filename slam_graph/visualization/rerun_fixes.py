@@ -161,8 +161,9 @@ class FixViews:
         if data is not None:
             later = estimator.config.on_the_clock(data.without_odometry())
             self._waiting = AidingData.concatenate([self._waiting, later])
-        due = self._waiting.within(None, estimator.solved_ns)
-        self._waiting = self._waiting.within(estimator.solved_ns, None)
+        solved_ns = _solved_ns(estimator)
+        due = self._waiting.within(None, solved_ns)
+        self._waiting = self._waiting.within(solved_ns, None)
         placed = int(np.sum(np.isfinite(due.pose_sigmas[:, :3]).all(axis=1)))
         bad = self._rejected("gnss", len(due.fix_stamps_ns), estimator)
         bad_poses = self._rejected("poses", placed, estimator)
@@ -180,3 +181,11 @@ class FixViews:
         tested, rejected = counts - self._counts.get(source, np.zeros(2, np.int64))
         self._counts[source] = counts
         return bool(tested == rejected == count)
+
+
+def _solved_ns(estimator: Estimator) -> int:
+    """Time of the state at the last frame that was solved; measurements are on its clock, too."""
+    stamp_ns, offset_ns = estimator.solved_ns, round(estimator.rig.pose_offset_s * 1e9)
+    # before the first frame the stamp is the least there is
+    later_ns = max(stamp_ns + offset_ns, int(np.iinfo(np.int64).min))
+    return estimator.times_ns.get(stamp_ns, later_ns)

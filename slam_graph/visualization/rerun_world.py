@@ -146,7 +146,8 @@ def _show_frames(series: SeriesLog, table: Mapping[str, Any]) -> frozenset[str]:
     """Counts, rejections, cost and NIS of each frame."""
     if not table:
         return frozenset()
-    stamps_ns = np.asarray(table["stamp_ns"], np.int64)
+    # on the clock of the states, as what else is shown of them
+    stamps_ns = np.asarray(table.get("state_ns", table["stamp_ns"]), np.int64)
     numbers = np.arange(len(stamps_ns))
     plots = {
         "backend/counts": _COUNTS,

@@ -203,8 +203,12 @@ def _first(bag: Bag, topic: str) -> Message:
 
 def _beside(bag: Bag, topic: str) -> str:
     """The topic with the calibration of the camera that publishes images under a topic."""
-    base = topic if bag.topics[topic] == IMAGE else topic.rpartition("/")[0]
-    return f"{base.rpartition('/')[0]}/camera_info"
+    return f"{_base(bag, topic).rpartition('/')[0]}/camera_info"
+
+
+def _base(bag: Bag, topic: str) -> str:
+    """The topic of images without the name of their transport, such as `compressed`."""
+    return topic if bag.topics[topic] == IMAGE else topic.rpartition("/")[0]
 
 
 def _info_beside(bag: Bag, topic: str) -> _CameraInfo:
@@ -257,9 +261,9 @@ def _camera_info_of(message: Any) -> _CameraInfo:
     )
 
 
-def _is_rectified(topic: str) -> bool:
+def _is_rectified(bag: Bag, topic: str) -> bool:
     """Whether the images on a topic are rectified, by its name."""
-    return "rect" in topic.rpartition("/")[2]
+    return "rect" in _base(bag, topic).rpartition("/")[2]
 
 
 def camera_T_image(bag: Bag, topic: str) -> gtsam.Pose3:
@@ -270,7 +274,7 @@ def camera_T_image(bag: Bag, topic: str) -> gtsam.Pose3:
     Raises:
         DataError: if R is not a rotation.
     """
-    if not _is_rectified(topic) or bag.topics.get(_beside(bag, topic)) != CAMERA_INFO:
+    if not _is_rectified(bag, topic) or bag.topics.get(_beside(bag, topic)) != CAMERA_INFO:
         return gtsam.Pose3()
     R = _info_beside(bag, topic).R
     matrix = np.eye(4)
@@ -280,7 +284,7 @@ def camera_T_image(bag: Bag, topic: str) -> gtsam.Pose3:
 
 def _camera(bag: Bag, topic: str, info: _CameraInfo) -> Camera:
     """The intrinsics of the camera whose images are on a topic."""
-    rectified = _is_rectified(topic)
+    rectified = _is_rectified(bag, topic)
     matrix, D, size = info.P if rectified else info.K, info.D, info.size
     fx, fy, cx, cy = matrix[[0, 1, 0, 1], [0, 1, 2, 2]].tolist()
     intrinsics, where = (fx, fy, cx, cy), f"{bag.path}: CameraInfo of {topic}"
