@@ -237,4 +237,4 @@ def test_keyframes_and_map_have_the_calibration_that_is_estimated() -> None:
         np.testing.assert_array_equal(ours.points, expected.points)
     MapBuilding(result, stage, Diagnostics()).finish()
     assert result.slam_map is not None
-    assert result.slam_map.recordings[0].rig is true
+    assert result.slam_map.recordings[0].rig.cameras is true.cameras

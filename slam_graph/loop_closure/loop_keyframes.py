@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TypeAlias
+from typing import ClassVar, TypeAlias
 
 import cv2
 import gtsam
@@ -28,8 +28,6 @@ POINT_FRAMES = 10
 """Number of recent frames from which the points of a keyframe are triangulated …"""
 POINT_FRAME_SPACING_S = 0.1
 """… and the time between them: within a second the estimator hardly drifts."""
-LAST_POSES = 3
-"""Poses that tell how the body moves while a rolling shutter exposes a frame."""
 MAX_REPROJECTION_PX = 3.0
 """Points of a larger root-mean-square reprojection error are left out."""
 MAX_DEPTH_ERROR = 0.1
@@ -140,9 +138,11 @@ class KeyframeLog:
     Attributes:
         keyframes: so far.
         rig: the cameras, as they are known now.
+        LAST_POSES: poses that tell how the body moves while a rolling shutter exposes a frame.
     """
 
     Describer: TypeAlias = KeyframeDescriber
+    LAST_POSES: ClassVar[int] = 3
 
     def __init__(self, rig: Rig, config: KeyframeConfig) -> None:
         self.keyframes: list[Keyframe] = []
@@ -152,7 +152,7 @@ class KeyframeLog:
         self._describer = KeyframeDescriber(camera, config.further_corners)
         self._focal_px = float(np.sqrt(camera.fx * camera.fy))
         self._recent: deque[PosedFrame] = deque(maxlen=POINT_FRAMES)
-        self._last: deque[tuple[int, gtsam.Pose3]] = deque(maxlen=LAST_POSES)
+        self._last: deque[tuple[int, gtsam.Pose3]] = deque(maxlen=self.LAST_POSES)
 
     def add(
         self, frame: FeatureFrame, world_T_body: gtsam.Pose3, image: Image | None = None
@@ -199,7 +199,7 @@ class KeyframeLog:
         ]
         self._recent = deque((view.moved(motion) for view in self._recent), maxlen=POINT_FRAMES)
         last = ((stamp_ns, motion.compose(pose)) for stamp_ns, pose in self._last)
-        self._last = deque(last, maxlen=LAST_POSES)
+        self._last = deque(last, maxlen=self.LAST_POSES)
 
     def at(self, trajectory: Trajectory) -> list[Keyframe]:
         """The keyframes at the poses of a trajectory; those outside of it keep their poses.

@@ -23,7 +23,6 @@ from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import DataError
 from slam_graph.geometry import NavState, Trajectory
 from slam_graph.loop_closure import Keyframe, KeyframeLog, Loop, close_loops
-from slam_graph.loop_closure.loop_keyframes import LAST_POSES
 from slam_graph.maps import MapLocalizer, MapRecording, SlamMap, build_map
 from slam_graph.pipeline.stage import COMPLETED, EstimatedFrame, Stage, warn_on_failure
 from slam_graph.pose_graph import Poses
@@ -247,7 +246,7 @@ class Localization(Stage):
         self._localizer = MapLocalizer(known, rig, loops, config)
         self._name, self._diagnostics = result.input.info.name, diagnostics
         self._log = result.begin_localization(known)
-        self._last: deque[tuple[int, gtsam.Pose3]] = deque(maxlen=LAST_POSES)
+        self._last: deque[tuple[int, gtsam.Pose3]] = deque(maxlen=KeyframeLog.LAST_POSES)
 
     def frame(self, frame: EstimatedFrame) -> None:
         """Take a frame, if there is an estimate.
