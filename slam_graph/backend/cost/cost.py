@@ -283,7 +283,7 @@ class Cost:
                 of_dynamics += range(rows.start, end)
         if self.rig.needs_two_views and not self.defines_unit:
             arm, alone = self.rig.body_p_camera[0], len(of_dynamics) == end
-            chosen = slice(None) if alone else of_dynamics
+            chosen = slice(None) if alone else of_dynamics  # without a copy where all are
             Ab[chosen] = without_scale(Ab[chosen], self.state, layout, arm)
         return Ab
 

@@ -159,7 +159,7 @@ class FeatureSelection:
             observed = rig.renormalized(obs.subset(new))
             result = triangulate(observed, rig, *poses, self.config.triangulation)
             noise = float(np.max(self.pixels.sigma_px)) / rig.cameras[0].fx
-            # a mounting that is not known well bends the depths of all features alike
+            # an uncertain mounting makes the depths of all features uncertain
             noise = float(np.hypot(noise, rig.turn_sigma_rad(window.prior)))
             known = noise * result.depth_error < self.policy.state_feature_depth_error
             points[new], good[new] = result.points, result.good & (known | ~lasting[new])

@@ -103,14 +103,6 @@ class RigProjection:
     calibration_keys: tuple[int, ...] = ()
     velocities = RowVelocities()
 
-    def turn_sigma_rad(self, prior: SquareRootInformation) -> float:
-        """Largest standard deviation of the rotation from the first camera to another one.
-
-        Args:
-            prior: on the variables of the window.
-        """
-        return 0.0
-
     def __init__(
         self,
         rig: Rig,
@@ -140,6 +132,14 @@ class RigProjection:
         self._taken_by = taken_by or rig
 
     # --- overridden where the calibration is estimated (see `calibrated_projection`) --------------
+
+    def turn_sigma_rad(self, prior: SquareRootInformation) -> float:
+        """Largest standard deviation of the rotation from the first camera to another one, rad.
+
+        Args:
+            prior: on the variables of the window.
+        """
+        return 0.0
 
     def at(self, state: State) -> RigProjection:
         """The projection with the calibration of a state, and the motions of its frames."""
