@@ -135,7 +135,7 @@ class DirectionTracker:
         motion = self._window.motions.get(frame.stamp_ns)
         order = np.argsort(seen.ids)
         rows = order[np.searchsorted(seen.ids[order], ids)]
-        far = np.full(len(ids), np.inf)  # nobody knows how far
+        far = np.full(len(ids), np.inf)  # their distances are not known
         rays = unrolled(seen, rows, self._window.rig, motion, far)
         rays = np.column_stack([rays, np.ones(len(ids))])
         rays /= np.linalg.norm(rays, axis=1, keepdims=True)
