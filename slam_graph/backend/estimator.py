@@ -36,6 +36,7 @@ from slam_graph.backend.initialization.start_calibration import FoundCalibration
 from slam_graph.backend.initialization.start_up import StartUp
 from slam_graph.backend.online_calibration import MAX_EARLY_NS, CalibrationVariables
 from slam_graph.backend.policies import AlgorithmConfig
+from slam_graph.backend.rigid_motion_watch import RigidMotionWatch
 from slam_graph.backend.solve.single_thread import SingleThread
 from slam_graph.backend.window import Window
 from slam_graph.diagnostics import Diagnostics
@@ -109,6 +110,7 @@ class Estimator(EstimatorKnowledge):
         self._variables, self._start_mode = config.calibration, config.initialization.mode
         self.replayed: list[NavState] | None = None
         self.states: list[NavState] = []
+        self._motions = RigidMotionWatch(rig, config, self.diagnostics)
         self._begin(ImuBuffer())
 
     def _begin(self, imu: ImuBuffer) -> None:
@@ -169,6 +171,7 @@ class Estimator(EstimatorKnowledge):
         held, imu = self._held or (), self._context.imu
         frames = [] if change is None else [*change.after(self._check.recent), *held]
         self._check.forget()
+        self._motions.forget()
         if change is not None:
             self.clock_changes = self.clock_changes.and_then(change)
             imu.data = change.corrected(imu.data)
@@ -230,6 +233,7 @@ class Estimator(EstimatorKnowledge):
 
     def _take(self, frame: FeatureFrame) -> NavState | None:
         """The state at a frame; all of them anew once fixes tell where their world is."""
+        self._motions.keep(frame)
         state = self._solve(frame)
         found = None if self.window is None else self.aiding.alignment(state)
         if self.window is None or found is None:
@@ -264,17 +268,37 @@ class Estimator(EstimatorKnowledge):
         self.clock_change = found or self.clock_change
         self._context.propagation.noise.watch_vibration(imu, stamp_ns)
         still_sigma = self._standstill.add_frame(imu, stamp_ns, frame)
-        whole, frame = frame, frame.without(self._standstill.dynamic)
+        whole, frame = frame, self._motions.used(frame).without(self._standstill.dynamic)
         if self.window is None:
             self.window = self._try_to_start(stamp_ns, frame)
         elif stamp_ns > self.window.stamp_ns:
             stepped = self._engine.step(self.window, stamp_ns, frame, still_sigma, self.report)
-            return self._reviewed(whole, self._dynamics.reported(stepped), still_sigma is not None)
+            solved = self._dynamics.reported(stepped)
+            return self._compared(whole, self._reviewed(whole, solved, still_sigma is not None))
         elif stamp_ns == self.window.stamp_ns:
             self._context.add_observations(self.window, frame)
+            self._context.note(frame)
         if self.window is None or stamp_ns < self.window.stamp_ns:
             return None
-        return self._dynamics.reported(self.window.current(self.window.prior))
+        first = self._dynamics.reported(self.window.current(self.window.prior))
+        return self._compared(whole, first)
+
+    def _compared(self, frame: FeatureFrame, state: NavState) -> NavState | None:
+        """The state, or that of an estimate that began again without what moves."""
+        if not self._motions.wanted:
+            return state
+        again = self._motions.compare(frame, state, self.motion, self.assumed_noise_px)
+        if self.window is not None:
+            self.window.tracks.remove(Outcome.DYNAMIC, self._motions.moving_of(frame))
+        if not again:
+            return state
+        given, frames = self._given, self._motions.begin_again()
+        self._begin(self._context.imu)
+        if given is not None:
+            self.start(given, with_rate=True)
+        states = [solved for kept in frames if (solved := self._solve(kept)) is not None]
+        self.states = self.replayed = states
+        return states[-1] if states else None
 
     def _begin_anew(self, found: FoundCalibration) -> NavState | None:
         """Start again with another calibration, from the frames of the last seconds."""
@@ -374,27 +398,3 @@ class Estimator(EstimatorKnowledge):
         self._standstill.add_dynamic(ids)
         if self.window is not None and len(ids):
             self.window.tracks.remove(Outcome.DYNAMIC, ids)
-
-    # --- output ----------------------------------------------------------------------------------
-
-    @property
-    def initialized(self) -> bool:
-        """Whether there is a state."""
-        return self.window is not None
-
-    @property
-    def start_is_given(self) -> bool:
-        """Whether the first state was given, by `start`."""
-        return self._given is not None
-
-    @property
-    def waiting_for(self) -> str:
-        """What a start still needs, and the likeliest cause of the lack."""
-        if not self._check.mounted:
-            return self._check.waiting_for
-        return self._start_up.waiting_for(self._check.contradiction(self._context.imu))
-
-    @property
-    def dynamic(self) -> IntArray:
-        """Ids (N,) of the tracked features that move by themselves, ascending."""
-        return self._standstill.dynamic

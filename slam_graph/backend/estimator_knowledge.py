@@ -9,18 +9,22 @@ from collections.abc import Sequence
 import gtsam
 import numpy as np
 
-from slam_graph.arrays import FloatArray, IntArray
+from slam_graph.arrays import FloatArray, IntArray, ascending_union
 from slam_graph.backend.aiding.aiding_factors import Aiding
 from slam_graph.backend.backend_config import BackendConfig
 from slam_graph.backend.cost.track_fit import TrackFit
+from slam_graph.backend.cost.zero_velocity import StandstillDetector
 from slam_graph.backend.engine_protocol import Engine, EngineContext, StepReport
 from slam_graph.backend.initialization.clock_change import ClockChanges
 from slam_graph.backend.initialization.segment_joint import SegmentJoint
+from slam_graph.backend.initialization.start_calibration import StartCalibration
 from slam_graph.backend.initialization.start_up import StartUp
+from slam_graph.backend.rigid_motion_watch import RigidMotionWatch
 from slam_graph.backend.solve.state import FrameMotion
 from slam_graph.backend.window import Window
 from slam_graph.backend.window_graph import WindowGraph
 from slam_graph.errors import EstimationError
+from slam_graph.geometry import NavState
 from slam_graph.sensors import AidingData, CalibrationEstimate, Rig
 
 
@@ -47,6 +51,10 @@ class EstimatorKnowledge:
     _engine: Engine
     _context: EngineContext
     _start_up: StartUp
+    _given: NavState | None
+    _check: StartCalibration
+    _standstill: StandstillDetector
+    _motions: RigidMotionWatch
 
     @property
     def imu_stamps_ns(self) -> IntArray:
@@ -188,3 +196,25 @@ class EstimatorKnowledge:
         if self.window is None:
             return np.zeros(0, np.int64), np.zeros((0, 3))
         return self._engine.landmarks(self.window)
+
+    @property
+    def initialized(self) -> bool:
+        """Whether there is a state."""
+        return self.window is not None
+
+    @property
+    def start_is_given(self) -> bool:
+        """Whether the first state was given, by `start`."""
+        return self._given is not None
+
+    @property
+    def waiting_for(self) -> str:
+        """What a start still needs, and the likeliest cause of the lack."""
+        if not self._check.mounted:
+            return self._check.waiting_for
+        return self._start_up.waiting_for(self._check.contradiction(self._context.imu))
+
+    @property
+    def dynamic(self) -> IntArray:
+        """Ids (N,) of the tracked features that move by themselves, ascending."""
+        return ascending_union(self._standstill.dynamic, self._motions.moving)

@@ -46,6 +46,9 @@ _DOUBTS = ("start_corrected", "new_segment", "scale_unknown")
 """Warnings after which an estimate that came to its end is doubted."""
 _MAX_REJECTED = 0.05
 """The same for the share of features that the gate rejects. Of good recordings it is 2 to 4 %."""
+_WORLD_NOT_CLEAR = (
+    "something that moves covers so much of the images that it may have been taken for the world"
+)
 _FEWEST_SHARED = 0.25
 """The same for the share of features that the second camera sees, where it sees any: half of them
 and more where cameras are mounted side by side."""
@@ -173,7 +176,11 @@ class Verdict(Stage):
             None if adjusted is None else adjusted.history,
         )
         result.evidence = asdict(found)
-        return found.is_unusual, found.causes if found.contradicts else []
+        causes = list(found.causes) if found.contradicts else []
+        unclear = self._diagnostics.counts["world_not_clear"] > 0
+        if unclear:
+            causes.append(_WORLD_NOT_CLEAR)
+        return found.is_unusual or unclear, causes
 
     def _watch_start(self, stamp_ns: int, rig: Rig) -> None:
         """Look now and then what keeps a run from starting; after a loss at once as well.
