@@ -27,6 +27,7 @@ from typing import IO, Any
 
 import typer.main
 from limits import HANG_S
+from unrendered import render_nothing
 
 IMPORTED = (
     "slam_graph.cli.main",
@@ -48,6 +49,7 @@ def slam_graph(
     cwd: Path | None = None,
     env: Mapping[str, str] | None = None,
     limit: int | None = None,
+    rendered: bool = False,
 ) -> Done:
     """Run a command to its end, as `subprocess.run` with `capture_output` does.
 
@@ -56,6 +58,7 @@ def slam_graph(
         cwd: the folder it runs in; the present one if not given.
         env: the whole environment; the present one if not given.
         limit: bytes that a file may have.
+        rendered: whether pictures are rendered.
     """
     words = [str(argument) for argument in arguments]
     asked = {
@@ -63,6 +66,7 @@ def slam_graph(
         "cwd": str(cwd or Path.cwd()),
         "env": dict(os.environ if env is None else env),
         "limit": limit,
+        "rendered": rendered,
     }
     process = _forking_process()
     assert process.stdin is not None
@@ -126,6 +130,8 @@ def _become(asked: dict[str, Any], writing: tuple[int, ...]) -> None:
     if asked["limit"] is not None:
         signal.signal(signal.SIGXFSZ, signal.SIG_IGN)  # to write gives an error then
         resource.setrlimit(resource.RLIMIT_FSIZE, (asked["limit"],) * 2)
+    if not asked["rendered"]:
+        render_nothing()
     sys.path[0] = asked["cwd"]
     sys.argv = ["slam-graph", *asked["words"]]
 

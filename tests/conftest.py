@@ -5,16 +5,20 @@
 import gc
 import logging
 import os
+from collections.abc import Iterator
 from functools import cache
 from importlib import import_module
 from pathlib import Path
 from pkgutil import iter_modules
 from typing import TYPE_CHECKING
 
+import damage
 import gtsam
 import pytest
 import typer.main
 import typer.testing
+import unrendered
+from groups import slow
 
 import slam_graph.kernels
 
@@ -23,8 +27,12 @@ if TYPE_CHECKING:
 
 
 def pytest_configure() -> None:
-    """The command line is put together once, instead of by each command that a test gives."""
+    """The command line is put together once, instead of by each command that a test gives.
+
+    Pictures are not rendered, but where `rendered` is used.
+    """
     typer.main.get_command = typer.testing._get_command = cache(typer.main.get_command)
+    unrendered.render_nothing()
 
 
 def pytest_sessionstart(session: pytest.Session) -> None:
@@ -35,12 +43,15 @@ def pytest_sessionstart(session: pytest.Session) -> None:
 
 
 LONGEST = (
-    "damaged_files", "experiment", "verdict", "recovery", "batch", "diagnosis", "map_runs",
-    "notebooks", "estimator_end_to_end", "position_fixes", "clock_monitor", "signals", "rerun",
-    "take_off", "repeats", "final_ba", "one_camera", "rolling_shutter", "damaged_results",
+    "diagnosis", "verdict", "recovery", "experiment", "damaged_files", "batch", "notebooks",
+    "disk", "take_off", "clock_monitor", "map_runs", "one_camera", "cli_run", "repeats",
+    "estimator_end_to_end", "final_ba", "position_fixes", "estimator_first_estimates",
+    "datasets_contract", "window_graph", "simulation_images", "estimator_bad_input", "signals",
+    "initialization_clock", "imu_consistent_path", "rerun", "without_imu", "rolling_shutter",
+    "calibration_convergence", "imu_noise_estimation", "gauge_steps", "objects", "public_api",
 )  # fmt: skip
-"""Files of tests that take longest in the quick group; they run first, so that no core ends with
-one."""
+"""Files of tests that take longest in the quick group, by their CPU time; they run first, so that
+no core ends with one."""
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
@@ -80,6 +91,22 @@ def stock(tmp_path_factory: pytest.TempPathFactory) -> "Stock":
     folder = os.environ.get("SLAM_GRAPH_DATA")
     real = Path(folder).resolve() if folder and Path(folder).is_dir() else None
     return Stock(tmp_path_factory.mktemp("stock"), real)
+
+
+@pytest.fixture(scope="module")
+def rendered() -> Iterator[None]:
+    """Pictures are what a user sees, from here to the end of the file of tests."""
+    from slam_graph.visualization import style
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(style.Picture, "_drawn", vars(style)["rendered"])
+        yield
+
+
+@pytest.fixture(params=[0, slow(1)], ids=["first_half", "second_half"])
+def half(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Files are damaged in half of all ways, the other half is slow."""
+    monkeypatch.setattr(damage, "half", request.param)
 
 
 @pytest.fixture

@@ -21,7 +21,11 @@ from slam_graph.settings import tree
 
 CAMPAIGN = int(os.environ.get("SLAM_GRAPH_MUTATIONS", "0"))
 SEED = os.environ.get("SLAM_GRAPH_MUTATIONS_SEED", str(time.time_ns()) if CAMPAIGN else "0")
-IN_CI = 200
+HALVES = range(100), range(100, 200)
+"""Numbers of the mutations of a file: `make test` tries the first half, `make slow` the second."""
+
+half = 0
+"""Which of the two is tried; the fixture of this name sets it."""
 
 ON_LINUX = Path("/proc/self/status").exists()
 
@@ -92,7 +96,7 @@ def token(content: bytes, at: int) -> tuple[int, int]:
 
 
 def tried(
-    file: Path, read: Callable[[], object], in_ci: int = IN_CI, most_s: float = MOST_S
+    file: Path, read: Callable[[], object], in_ci: int | None = None, most_s: float = MOST_S
 ) -> None:
     """Damage a file in many ways, and read it each time.
 
@@ -101,17 +105,20 @@ def tried(
     Args:
         file: a valid one.
         read: reads it, and does what is to be done with what it says.
-        in_ci: how many ways, outside of campaigns.
+        in_ci: how many ways, outside of campaigns; those of the present half if not given.
         most_s: time of the CPU that it may take.
     """
     whole = file.read_bytes()
     read()  # it is valid
     read()  # what is loaded once is loaded
     failures: dict[str, str] = {}
+    numbers = HALVES[half] if in_ci is None else range(in_ci)
+    if CAMPAIGN:
+        numbers = range(CAMPAIGN)
     with pytest.MonkeyPatch.context() as patch:
         # of the other files, which are the same each time, YAML is parsed once
         patch.setattr(tree, "parse_node", lru_cache(maxsize=16)(tree.parse_node))
-        for number in range(CAMPAIGN or in_ci):
+        for number in numbers:
             file.unlink()  # a file that is cut and written again is waited for until it is on disk
             file.write_bytes(damaged(whole, edits(number)))
             failure = failure_of(read, most_s)

@@ -37,7 +37,7 @@ LARGEST_STAMP_NS = 2**62
 """What readers take for a time is nearer to zero."""
 
 
-def examples(in_ci: int = 60) -> settings:
+def examples(in_ci: int = 30) -> settings:
     """How a property is tried: always the same examples, but for a campaign."""
     return settings(
         max_examples=CAMPAIGN or in_ci,

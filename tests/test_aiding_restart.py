@@ -156,7 +156,7 @@ def test_fixes_before_the_first_state_are_not_used() -> None:
 @pytest.mark.parametrize("started", [False, True])
 def test_what_is_received_is_not_kept_for_ever(started: bool) -> None:
     """Neither before there is a state nor afterwards."""
-    aiding, path = Aiding(CONFIG, level=True), states(0, 400)
+    aiding, path = Aiding(CONFIG, level=True), states(0, 260)
     turns = np.tile([0.0, 0.0, 0.0, 1.0], (1, 1))
     for before, state in pairwise(path):
         stamps_ns = np.array([state.stamp_ns])
@@ -171,6 +171,6 @@ def test_what_is_received_is_not_kept_for_ever(started: bool) -> None:
     aiding.restart()
     assert aiding.by_odometry(path[-70], path[-60]) is not None
     assert aiding.by_odometry(path[-170], path[-160]) is None
-    assert aligned(aiding, path[:200]) is None
+    assert aligned(aiding, path[:120]) is None
     aiding.restart()
     assert aligned(aiding, path[-70:]) is not None

@@ -7,6 +7,8 @@ import re
 from collections.abc import Iterator
 from pathlib import Path
 
+from sources import Import, imports_of
+
 import slam_graph
 
 PACKAGE = Path(slam_graph.__file__).parent
@@ -36,26 +38,22 @@ def imports() -> Iterator[tuple[str, str, str]]:
         importer = path.relative_to(PACKAGE).with_suffix("").parts[0]
         if importer == "__init__":
             continue  # it imports nothing before a name is used
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        for node in imports_of(path):
             for module in _modules(node):
                 root, _, inner = module.partition(".")
                 imported = inner.split(".")[0]
                 if root == "slam_graph" and imported and imported != importer:
-                    place = f"{path.relative_to(PACKAGE)}:{getattr(node, 'lineno', 0)}: {module}"
+                    place = f"{path.relative_to(PACKAGE)}:{node.lineno}: {module}"
                     yield importer, imported, place
 
 
-def _modules(node: ast.AST) -> list[str]:
+def _modules(node: Import) -> list[str]:
     if isinstance(node, ast.Import):
         return [alias.name for alias in node.names]
-    if isinstance(node, ast.ImportFrom):
-        inner = node.module or ""
-        return (
-            [f"slam_graph.{alias.name}" for alias in node.names]
-            if inner == "slam_graph"
-            else [inner]
-        )
-    return []
+    inner = node.module or ""
+    return (
+        [f"slam_graph.{alias.name}" for alias in node.names] if inner == "slam_graph" else [inner]
+    )
 
 
 def test_every_package_is_in_the_picture() -> None:

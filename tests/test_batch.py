@@ -120,6 +120,7 @@ def test_recordings_for_the_viewer_and_factor_graphs_are_written(tmp_path: Path)
     assert wrong.returncode == 2
 
 
+@pytest.mark.slow
 def test_a_killed_process_stops_no_other_and_is_done_by_the_next_call(tmp_path: Path) -> None:
     for seed in range(2):
         flight(tmp_path / "data" / f"flight_{seed}", seed)
@@ -197,6 +198,27 @@ def test_an_interruption_stops_all_runs_that_go_on(tmp_path: Path) -> None:
     assert sg.load_result(out / "flight_0").status == "ok"
     left = tasks(tmp_path / "data", out, overrides=FAST)
     assert [task.is_done() for task in left] == [True, False, False]
+
+
+def test_a_process_that_is_killed_stops_no_other(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The slow test of a killed process has a whole batch around it, and calls it once more."""
+
+    class Process(subprocess.Popen[str]):
+        def __init__(self, task: str) -> None:
+            dies = "import os, signal; os.kill(os.getpid(), signal.SIGKILL)"
+            code = dies if "recording_0" in task else "raise SystemExit(0)"
+            super().__init__([sys.executable, "-c", code], stderr=subprocess.PIPE, text=True)
+
+        def release(self) -> None:
+            """Nothing is held."""
+
+    monkeypatch.setattr(executors, "_TaskProcess", Process)
+    names = [tmp_path / f"recording_{number}" for number in range(2)]
+    some = [BatchTask(name=n.name, data=str(n), config=CONFIG, output=tmp_path) for n in names]
+    told = {task.name: said for task, said in executors.LocalProcesses(1).do(some)}
+    assert told == {"recording_0": "ended by signal 9", "recording_1": None}
 
 
 WAITS_FOR_OTHERS = """

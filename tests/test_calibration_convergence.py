@@ -11,6 +11,7 @@ import gtsam
 import numpy as np
 import pytest
 from flight import Flight, packets, rig, room
+from groups import slow_but
 from scipy.stats import chi2
 from typer.testing import CliRunner
 
@@ -145,7 +146,7 @@ def check_consistent(estimate: CalibrationEstimate, true: Rig) -> None:
     assert np.all(squares < chi2.ppf(0.999, dims))
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", slow_but({"extrinsics"}, KINDS))
 def test_each_kind_is_found_alone(kind: str) -> None:
     true = rig(1)
     nominal = wrong(true, (kind,))

@@ -21,7 +21,9 @@ LOST = "camera_lost:at_s=3,duration_s=60,camera={}"
 
 @pytest.fixture(scope="module")
 def tracks() -> RecordedSequence:
-    return simulate(trajectory="figure8", cameras=2, duration_s=7.0, seed=1)
+    return simulate(
+        trajectory="figure8", cameras=2, duration_s=7.0, seed=1, tracks={"features": 80}
+    )
 
 
 def frames_kept(sequence: RecordedSequence) -> float:

@@ -78,7 +78,7 @@ def test_completion_is_installed(tmp_path: Path) -> None:
 
 def test_a_terminal_shows_bars_of_the_run_and_of_the_final_adjustment(tmp_path: Path) -> None:
     """In a terminal the run has a bar, and the final adjustment one that moves."""
-    shown = in_terminal("run", "demo", "--duration", "9", "--output", str(tmp_path))
+    shown = in_terminal("run", "demo", "--duration", "7.5", "--output", str(tmp_path))
     assert shown.index("loading") < shown.index("frames")
     parts = [int(part) for part in re.findall(r"final BA[^\n]*?(\d+)%", shown)]
     assert len(set(parts)) > 2

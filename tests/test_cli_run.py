@@ -40,8 +40,10 @@ SHORT = ("--duration", "3", "--set", "min_coverage=0.1", *STATIC)
 """The demo stands still when it begins: looking for a motion there would only take time."""
 
 
-def run(tmp_path: Path, *arguments: str | Path) -> subprocess.CompletedProcess:
-    return slam_graph("run", *arguments, cwd=tmp_path)
+def run(
+    tmp_path: Path, *arguments: str | Path, rendered: bool = False
+) -> subprocess.CompletedProcess:
+    return slam_graph("run", *arguments, cwd=tmp_path, rendered=rendered)
 
 
 def latest(tmp_path: Path) -> Path:
@@ -54,10 +56,11 @@ def metrics_of(tmp_path: Path) -> dict:
 
 
 def test_a_run_writes_its_files_and_says_where(tmp_path: Path) -> None:
-    done = run(tmp_path, "demo", *SHORT)
+    done = run(tmp_path, "demo", *SHORT, rendered=True)
     assert (done.returncode, done.stderr) == (0, "")
     folder = latest(tmp_path)
     assert {path.name for path in folder.iterdir()} == FILES
+    assert (folder / "trajectory.png").stat().st_size > 10_000
     last = done.stdout.splitlines()[-2:]
     assert last[0] == str(folder.resolve().relative_to(tmp_path)) + "/"
     assert set(last[1].split()) == FILES

@@ -57,7 +57,7 @@ from slam_graph.simulation.simulator import simulate
 
 pytestmark = [
     pytest.mark.filterwarnings("error::RuntimeWarning"),
-    pytest.mark.usefixtures("quiet"),
+    pytest.mark.usefixtures("quiet", "half"),
 ]
 
 

@@ -96,6 +96,7 @@ def read_run(run: SavedRun) -> None:
         run.plot()
 
 
+@pytest.mark.usefixtures("half")
 @pytest.mark.parametrize(
     "name",
     [
@@ -109,6 +110,7 @@ def test_runs(saved: Path, tmp_path: Path, name: str) -> None:
     tried(folder / name, lambda: read_run(SavedRun(folder)))
 
 
+@pytest.mark.usefixtures("half")
 def test_settings_and_calibration_of_runs(saved: Path, tmp_path: Path) -> None:
     folder = shutil.copytree(saved, tmp_path / "run")
     tried(folder / "calibration.yaml", lambda: sound_rig(SavedRun(folder).rig))
@@ -126,6 +128,7 @@ class Done:
         return read_result(self.result) is not None
 
 
+@pytest.mark.usefixtures("half")
 def test_results_of_a_comparison(result: sg.RunResult, tmp_path: Path) -> None:
     """One that is damaged is done again; any other makes a row of the report."""
     path = tmp_path / "msckf.json"
@@ -177,6 +180,7 @@ def test_series_of_a_comparison_are_checked(
         read_series(path)
 
 
+@pytest.mark.usefixtures("half")
 def test_what_a_batch_says_of_a_run(tmp_path: Path) -> None:
     mark = {
         "schema_version": SCHEMA_VERSION,

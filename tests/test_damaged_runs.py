@@ -31,7 +31,7 @@ from slam_graph.simulation.simulator import simulate
 
 pytestmark = [
     pytest.mark.filterwarnings("error::RuntimeWarning"),
-    pytest.mark.usefixtures("quiet"),
+    pytest.mark.usefixtures("quiet", "rendered"),
 ]
 
 IN_CI = 3

@@ -64,7 +64,7 @@ class Stock:
         Matplotlib looks for fonts only once, unless the folder for what it found is another one.
         """
         env = {**os.environ, "MPLCONFIGDIR": str(fonts or self.fonts)}
-        return slam_graph(*arguments, cwd=folder, env=env, limit=limit)
+        return slam_graph(*arguments, cwd=folder, env=env, limit=limit, rendered=limit is not None)
 
 
 @pytest.fixture(scope="module")

@@ -22,6 +22,8 @@ from slam_graph.errors import ConfigError, DataError
 from slam_graph.geometry.trajectory import Trajectory
 from slam_graph.pose_graph import certify
 
+pytestmark = pytest.mark.usefixtures("rendered")
+
 PACKAGE = Path(sg.__file__).parent
 PNG = b"\x89PNG"
 VIEWER = "application/vnd.jupyter.widget-view+json"

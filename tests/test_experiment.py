@@ -21,8 +21,10 @@ from documented_runs import do_tasks_here
 from limits import HANG_S
 from test_batch import command as batch
 from test_batch import flight, wait_for, worker_of
+from typer.testing import CliRunner
 
 from slam_graph.cli.console import echo_rich_table
+from slam_graph.cli.main import app
 from slam_graph.config import load_config
 from slam_graph.datasets.dataset_registry import open_dataset
 from slam_graph.errors import ConfigError, DataError
@@ -42,8 +44,8 @@ STATIC = ("--set", "backend.initialization.mode=static")
 SHORT_SIM = [f"--sim-set={text}" for text in ("duration_s=6", "rate_hz=10", "tracks.features=50")]
 
 
-def compare(*arguments: str | Path) -> subprocess.CompletedProcess:
-    return slam_graph("compare", *arguments)
+def compare(*arguments: str | Path, rendered: bool = False) -> subprocess.CompletedProcess:
+    return slam_graph("compare", *arguments, rendered=rendered)
 
 
 @pytest.fixture
@@ -56,9 +58,8 @@ def here(monkeypatch: pytest.MonkeyPatch) -> None:
 def simulated(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict]:
     """Two algorithms on six simulated seconds."""
     folder = tmp_path_factory.mktemp("simulated")
-    done = compare(
-        "sim:figure8", *SHORT_SIM, "--algorithms", "msckf,swf", "--output", folder, "--json"
-    )
+    arguments = ("--algorithms", "msckf,swf", "--output", folder, "--json")
+    done = compare("sim:figure8", *SHORT_SIM, *arguments, rendered=True)
     assert done.returncode == 0, done.stderr
     return folder, json.loads(done.stdout)
 
@@ -131,6 +132,7 @@ def test_every_algorithm_is_in_the_report_with_its_numbers(simulated: tuple[Path
     kinds = ("paths", "summary", "errors", "nees", "steps")
     assert pictures == [f"figures/sim_figure8_{kind}.png" for kind in kinds]
     assert all((folder / name).read_bytes().startswith(b"\x89PNG") for name in pictures)
+    assert all((folder / name).stat().st_size > 10_000 for name in pictures)
     assert html.count("data:image/png;base64,") == len(pictures)
 
 
@@ -233,11 +235,12 @@ def test_tracks_are_recorded_anew_where_calibration_truth_or_data_have_changed(
 
 
 @pytest.mark.data
-def test_a_recording_of_tracks_with_its_truth(data_dir: Path, tmp_path: Path) -> None:
+def test_a_recording_of_tracks_with_its_truth(here: None, data_dir: Path, tmp_path: Path) -> None:
     truth = data_dir / "euroc_inertial" / "V1_01_easy"
     options = ("--groundtruth", f"demo={truth}", "--duration", "8", "--seeds", "3", *STATIC)
-    done = compare("demo", *options, "--algorithms", "msckf,swf", "--output", tmp_path, "--json")
-    assert done.returncode == 0, done.stderr
+    words = ["compare", "demo", *options, "--algorithms", "msckf,swf", "--output", str(tmp_path)]
+    done = CliRunner().invoke(app, [*words, "--json"])
+    assert done.exit_code == 0, done.output
     rows = json.loads(done.stdout)["rows"]
     assert [row["seeds"] for row in rows] == [1, 1]  # a seed would change nothing
     assert all(row["status"] == {"ok": 1} and row["ate_m"]["yaw"] < 0.1 for row in rows)
@@ -361,13 +364,16 @@ def scheduler(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
             process.wait(HANG_S)
 
 
-def test_a_dask_cluster_does_the_same(
-    scheduler: str, simulated: tuple[Path, dict], tmp_path: Path
-) -> None:
-    pytest.importorskip("distributed")
-    folder = tmp_path / "results"
-    options = ("--algorithms", "msckf", "--scheduler", scheduler, "--output", folder, "--json")
-    done = compare("sim:figure8", *SHORT_SIM, *options)
+def test_a_dask_cluster_does_the_same(simulated: tuple[Path, dict], tmp_path: Path) -> None:
+    """Its scheduler and worker are in this process; slow tests have them in their own."""
+    distributed = pytest.importorskip("distributed")
+    cluster = distributed.LocalCluster(
+        n_workers=1, threads_per_worker=2, processes=False, protocol="tcp", dashboard_address=None
+    )
+    with cluster:
+        options = ("--algorithms", "msckf", "--scheduler", cluster.scheduler_address)
+        output = ("--output", tmp_path / "results", "--json")
+        done = compare("sim:figure8", *SHORT_SIM, *options, *output)
     assert done.returncode == 0, done.stderr
     (row,) = json.loads(done.stdout)["rows"]
     local = simulated[1]["rows"][0]

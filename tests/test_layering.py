@@ -4,8 +4,9 @@
 
 import ast
 from collections.abc import Iterator
-from functools import cache
 from pathlib import Path
+
+from sources import imports_of, tree
 
 import slam_graph
 
@@ -47,17 +48,12 @@ def part_of(path: Path) -> str:
     return path.relative_to(PACKAGE).with_suffix("").parts[0]
 
 
-@cache
-def tree(path: Path) -> ast.Module:
-    return ast.parse(path.read_text(encoding="utf-8"))
-
-
 def imports(path: Path) -> Iterator[tuple[int, str]]:
     """Line and module of each import; a relative one begins with dots."""
-    for node in ast.walk(tree(path)):
+    for node in imports_of(path):
         if isinstance(node, ast.Import):
             yield from ((node.lineno, alias.name) for alias in node.names)
-        elif isinstance(node, ast.ImportFrom):
+        else:
             yield node.lineno, "." * node.level + (node.module or "")
             if node.module == "slam_graph":
                 yield from ((node.lineno, f"slam_graph.{alias.name}") for alias in node.names)

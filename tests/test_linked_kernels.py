@@ -118,20 +118,24 @@ def test_other_wrong_arguments_are_refused() -> None:
         apart(points, count)
 
 
-def test_a_library_can_be_made_anywhere(tmp_path: Path) -> None:
-    path = tmp_path / f"made{library_files._SUFFIX}"
-    _output(_MODULES, str(path), "ascending")
-    assert list(tmp_path.iterdir()) == [path]
-    library = linked._loaded(path, library_files.module_name(0))
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A library of three modules, one of which imports another, away from the sources."""
+    path = tmp_path_factory.mktemp("library") / f"made{library_files._SUFFIX}"
+    _output(_MODULES, str(path), "ascending", "state_rows", "null_space")
+    return path
+
+
+def test_a_library_can_be_made_anywhere(made: Path) -> None:
+    assert list(made.parent.iterdir()) == [made]
+    library = linked._loaded(made, library_files.module_name(0))
     assert library.are_among(np.arange(4), np.array([1, 3])).tolist() == [False, True, False, True]
 
 
-def test_a_module_that_another_one_imports_keeps_its_kernels(tmp_path: Path) -> None:
-    path = tmp_path / f"made{library_files._SUFFIX}"
-    _output(_MODULES, str(path), "state_rows", "null_space")
-    library = linked._loaded(path, library_files.module_name(0))
+def test_a_module_that_another_one_imports_keeps_its_kernels(made: Path) -> None:
+    library = linked._loaded(made, library_files.module_name(0))
     names = [name for name in dir(library) if not name.startswith("_")]
-    assert names == ["fill_state_rows", "triangularize_features"]
+    assert names == ["are_among", "fill_state_rows", "triangularize_features"]
 
 
 def test_a_part_that_was_left_is_not_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

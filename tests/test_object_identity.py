@@ -216,8 +216,9 @@ def test_a_track_goes_over_to_the_object_that_it_fits() -> None:
     assert other.members.tolist() == scene.ids(1).tolist()
 
 
+@pytest.mark.slow
 def test_two_objects_side_by_side() -> None:
-    """Their motions, and what is said of the errors; without masks."""
+    """Their motions, and what is said of the errors; without masks. One is in test_objects."""
     sequence = simulate(
         duration_s=6.0, rate_hz=RATE_HZ, seed=3, tracks={"pixel_sigma": SIGMA_PX},
         objects={"count": 2},

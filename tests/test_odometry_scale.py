@@ -5,6 +5,7 @@
 import gtsam
 import numpy as np
 import pytest
+from groups import slow
 
 from slam_graph.backend.aiding.odometry_factors import odometry_factor
 from slam_graph.backend.backend_config import BackendConfig, OdometryConfig
@@ -40,7 +41,7 @@ def _scale(sequence: SimulatedSequence, result: RunResult) -> float:
     return 1.0 / found.scale
 
 
-@pytest.mark.parametrize("algorithm", ["msckf", "okvis"])
+@pytest.mark.parametrize("algorithm", ["msckf", slow("okvis")])
 def test_lengths_are_in_metres(algorithm: str) -> None:
     sequence = _flight()
     result = run(sequence, algorithm=algorithm, final_ba={"enabled": False})
@@ -117,7 +118,7 @@ def test_two_views_get_the_unit_of_the_odometry_whatever_the_place_of_the_camera
     assert isinstance(in_metres([true[0]] * len(true), still, context), Refusal)
 
 
-@pytest.mark.parametrize("case", ["part", "late", "elsewhere"])
+@pytest.mark.parametrize("case", ["part", "late", slow("elsewhere")])
 def test_a_start_takes_what_the_odometry_covers(case: str) -> None:
     """A part of a recording, odometry that begins later than the images, and on another clock."""
     sequence = _flight(6.0)

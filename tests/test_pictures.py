@@ -23,6 +23,8 @@ from slam_graph.visualization.bundle_picture import bundle_figure
 from slam_graph.visualization.panels import Panel, panel_figure
 from slam_graph.visualization.style import line_styles
 
+pytestmark = pytest.mark.usefixtures("rendered")
+
 PNG = b"\x89PNG"
 
 

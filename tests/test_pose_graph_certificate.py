@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from groups import slow_but
 from pose_graphs import laps, turns
 from scipy.optimize import approx_fprime
 
@@ -29,7 +30,7 @@ SESYNC_OPTIMA = {
 
 
 @pytest.mark.data
-@pytest.mark.parametrize("name", SESYNC_OPTIMA)
+@pytest.mark.parametrize("name", slow_but({"parking-garage", "intel", "MIT"}, SESYNC_OPTIMA))
 def test_the_optima_of_sesync_are_found_and_certified(data_dir: Path, name: str) -> None:
     graph = read_pose_graph(data_dir / "posegraphs" / f"{name}.g2o")
     found = certify(graph, optimize_pose_graph(graph).poses)

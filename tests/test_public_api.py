@@ -117,13 +117,13 @@ def test_the_python_of_the_documents_runs(
 
 @pytest.fixture(scope="module")
 def result() -> sg.RunResult:
-    found = sg.run("demo", algorithm="swf", duration_s=9.0, overrides={"min_coverage": 0.1})
+    found = sg.run("demo", algorithm="swf", duration_s=7.0, overrides={"min_coverage": 0.1})
     found.check()
     return found
 
 
 def test_a_recording_is_run_by_its_name(result: sg.RunResult) -> None:
-    assert result.config == sg.load_config("swf", {"min_coverage": 0.1}, duration_s=9.0)
+    assert result.config == sg.load_config("swf", {"min_coverage": 0.1}, duration_s=7.0)
     again = sg.run(sg.open_dataset("demo"), result.config)
     np.testing.assert_array_equal(again.trajectory.positions, result.trajectory.positions)
 

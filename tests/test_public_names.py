@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from sources import imports_of, tree
 
 import slam_graph
 
@@ -46,10 +47,6 @@ def public_names(part: str) -> list[str]:
     return list(getattr(importlib.import_module(part), "__all__", []))
 
 
-def tree(path: Path) -> ast.Module:
-    return ast.parse(path.read_text(encoding="utf-8"))
-
-
 def part_of(path: Path) -> str:
     return path.relative_to(PACKAGE).with_suffix("").parts[0]
 
@@ -57,15 +54,13 @@ def part_of(path: Path) -> str:
 def imports_between_parts() -> Iterator[tuple[str, str, str]]:
     """Place, module and name of each import from another part of the package."""
     for path in SOURCES:
-        for node in ast.walk(tree(path)):
+        for node in imports_of(path):
             if isinstance(node, ast.Import):
                 found = [(alias.name, "") for alias in node.names]
-            elif isinstance(node, ast.ImportFrom):
+            else:
                 found = [(node.module or "", alias.name) for alias in node.names]
                 if node.module == "slam_graph":
                     found = list(names_of_parts(path, {alias.name for alias in node.names}))
-            else:
-                continue
             for module, name in found:
                 root, _, inner = module.partition(".")
                 if root == "slam_graph" and inner.split(".")[0] != part_of(path):

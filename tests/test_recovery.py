@@ -222,8 +222,8 @@ def test_a_segment_somewhere_else_is_not_joined_and_places_join_it(tmp_path: Pat
     """A part of the flight is cut out: the IMU knows nothing of it, recognised places do."""
     sequence = simulate(
         trajectory="rooms",
-        duration_s=75.0,
-        rate_hz=10.0,
+        duration_s=64.0,
+        rate_hz=5.0,
         seed=3,
         cameras=2,
         landmarks={"density": 4.0},

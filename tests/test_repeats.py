@@ -61,7 +61,7 @@ def run_all(
 def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with the recording."""
     folder = tmp_path_factory.mktemp("repeats")
-    simulate(kind="images", duration_s=3.0, rate_hz=10.0).save(folder / "flight")
+    simulate(kind="images", duration_s=2.0, rate_hz=10.0).save(folder / "flight")
     return folder
 
 

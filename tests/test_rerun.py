@@ -28,7 +28,7 @@ from slam_graph.visualization.rerun_palette import line_colours
 from slam_graph.visualization.rerun_progress import StepSeries
 from slam_graph.visualization.rerun_series import PLOTS
 
-DURATION_S = 6.0
+DURATION_S, RATE_HZ = 4.0, 10.0
 PLOTTED = ("/state/", "/imu/", "/error/", "/consistency/", "/backend/")
 TIMELINES = {"frame", "sensor_time"}
 OF_A_RUN = {
@@ -104,7 +104,7 @@ def watched(tmp_path_factory: pytest.TempPathFactory) -> tuple[RunResult, Conten
     """A short run that was watched in all detail."""
     path = tmp_path_factory.mktemp("rerun") / "recording.rrd"
     viewer = RerunRecording("save", "flight", path).viewer(detail="graph")
-    sequence = sg.simulate(trajectory="figure8", duration_s=DURATION_S, seed=1)
+    sequence = sg.simulate(trajectory="figure8", duration_s=DURATION_S, rate_hz=RATE_HZ, seed=1)
     logger = logging.getLogger("slam_graph")
     level = logger.level
     logger.setLevel(logging.INFO)  # as the command line has it

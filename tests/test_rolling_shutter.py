@@ -52,7 +52,7 @@ FAST = Flight(angle_rate=np.array([3.8, 2.6, 3.0]))
 """Turns at up to 2.6 rad/s."""
 
 TIMES = np.linspace(0.0, 3.0, 8)
-ROLLING = {"seed": 5, "rate_hz": 20.0, "trajectory": "random"}
+ROLLING = {"seed": 5, "rate_hz": 10.0, "trajectory": "random"}
 
 
 def rolling(cameras: int = 2, camera: Camera = RADTAN, readout_s: float = READOUT_S) -> Rig:

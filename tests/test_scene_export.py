@@ -22,9 +22,9 @@ from slam_graph.results.scene_files import write_colmap
 
 @pytest.fixture(scope="module")
 def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Four seconds of rendered images of one camera, as a recording."""
+    """Three seconds of rendered images of one camera, as a recording."""
     folder = tmp_path_factory.mktemp("scene") / "flight"
-    sg.simulate(kind="images", duration_s=4.0, rate_hz=8.0, cameras=1, seed=3).save(folder)
+    sg.simulate(kind="images", duration_s=3.0, rate_hz=8.0, cameras=1, seed=3).save(folder)
     return folder
 
 

@@ -129,7 +129,7 @@ def test_a_wrong_calibration_is_suspect(
         app,
         [
             *("run", str(recording), "--calibration", str(calibration), "--no-final-ba"),
-            *("--no-progress", "--duration", "9", "--output", str(tmp_path)),
+            *("--no-progress", "--duration", "7", "--output", str(tmp_path)),
         ],
     )
     assert done.exit_code == 4, done.output
@@ -145,7 +145,7 @@ def test_a_right_one_is_not_even_if_it_is_doubted(
 ) -> None:
     monkeypatch.setattr(verdict, "_MAX_REJECTED", -1.0)  # every run is diagnosed
     sequence = simulate(
-        trajectory=trajectory, cameras=cameras, duration_s=14.0, rate_hz=RATE_HZ, seed=seed
+        trajectory=trajectory, cameras=cameras, duration_s=10.0, rate_hz=RATE_HZ, seed=seed
     )
     result = run(sequence, overrides=CAUSAL)
     assert result.status == "ok", result.message
@@ -163,7 +163,8 @@ def test_a_failure_of_the_clock_watch_costs_no_diagnosis(monkeypatch: pytest.Mon
         raise ValueError("no clocks")
 
     monkeypatch.setattr(clock_watch.ClockWatch, "finish", fails)
-    result = run(flown(with_longer_lenses), overrides=CAUSAL)
+    settings = (*CAUSAL, "min_coverage=0.1")
+    result = run(flown(with_longer_lenses, duration_s=10.0), overrides=settings)
     assert result.warnings["diagnosis_failed"] == 1
     assert result.status == "suspect", result.message
     assert "calibrated focal length is 1." in result.message
