@@ -13,6 +13,7 @@ from typer.testing import CliRunner, Result
 from slam_graph.cli.main import app
 from slam_graph.datasets.dataset_registry import open_dataset
 from slam_graph.errors import ConfigError, DataError
+from slam_graph.simulation.simulator import simulate
 
 
 def frontend(*arguments: str | Path) -> Result:
@@ -55,6 +56,21 @@ def test_front_ends_are_compared_in_a_table(folder: Path) -> None:
     rows = [line.split() for line in done.stdout.splitlines() if line.startswith(("klt", "orb "))]
     assert [row[0] for row in rows] == ["klt/fast", "orb"]
     assert all(float(row[6]) < 2.0 for row in rows)
+
+
+def test_pictures_are_not_lost(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The picture that nobody named is given a number, one that was named is not replaced."""
+    monkeypatch.chdir(tmp_path)
+    simulate(kind="images", duration_s=0.5, rate_hz=4.0, cameras=1).save(tmp_path / "flight")
+    for _ in range(2):
+        assert frontend("flight").exit_code == 0
+    assert {path.name for path in tmp_path.glob("*.png")} == {"tracks.png", "tracks-2.png"}
+    assert "exists already" in str(frontend("flight", "--picture", "tracks.png").exception)
+    (tmp_path / "a.mp4").write_text("kept")
+    assert "exists already" in str(frontend("flight", "--video", "a.mp4").exception)
+    Path("tracks.png").write_text("of before")
+    assert frontend("flight", "--picture", "tracks.png", "--force").exit_code == 0
+    assert Path("tracks.png").read_bytes().startswith(b"\x89PNG")
 
 
 def test_faults_are_told() -> None:

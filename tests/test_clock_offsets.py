@@ -11,7 +11,7 @@ from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 import pytest
@@ -20,16 +20,23 @@ import slam_graph as sg
 from slam_graph.arrays import BoolArray, IntArray
 from slam_graph.backend import Estimator, Innovations
 from slam_graph.backend.engine_protocol import StepReport
+from slam_graph.config import load_config
 from slam_graph.datasets.calibration.kalibr_calibration import kalibr_text
 from slam_graph.datasets.data_checks import check_sequence
 from slam_graph.datasets.packets import packetize
+from slam_graph.datasets.sequence import SequenceInfo
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.results import RunResult
 from slam_graph.results.frame_table import FrameTable
+from slam_graph.results.object_files import objects_table
+from slam_graph.results.run_input import RunInput
 from slam_graph.results.run_logs import RunLogs
 from slam_graph.sensors import AidingData, FeatureFrame, FeatureObservations, ImuData, Packet, Rig
 from slam_graph.simulation.simulated_sequence import SimulatedSequence
 from slam_graph.simulation.simulator import euroc_rig
+
+if TYPE_CHECKING:
+    from slam_graph.backend import MovingObjects
 
 CAUSAL = ["final_ba.enabled=false", "limits.refuse_wrong_setup=false"]
 OFFSETS_S = (0.03, 3.0, -2.0)
@@ -246,6 +253,29 @@ def test_odometry_that_no_interval_uses_is_told_once(tmp_path: Path, shift_s: fl
     sequence.aiding = replace(data, odometry_stamps_ns=shifted_ns)
     result = sg.run(sequence, overrides=CAUSAL)
     assert result.warnings["odometry_unused"] == (shift_s != 0.0)
+
+
+def test_errors_of_objects_are_those_at_the_time_that_the_run_found() -> None:
+    """Frames are stamped by the cameras, the truth is on the clock of the IMU."""
+    given = euroc_rig()
+    stamps_ns = np.arange(10) * 10**8
+    truth = sg.Trajectory(stamps_ns, np.zeros((10, 3)), np.tile([0.0, 0.0, 0.0, 1.0], (10, 1)))
+    info = SequenceInfo("clip", "euroc", "images", 1, 0, 0, 0, 0, False)
+    asked = RunInput(info, load_config(), given, 0, 10**9, truth, object_truth={1: truth})
+    found: list[IntArray] = []
+
+    def errors(_: object, true_body: sg.Trajectory) -> SimpleNamespace:
+        found.append(true_body.stamps_ns)
+        return SimpleNamespace(table=dict)
+
+    smoothed = SimpleNamespace(errors=errors)
+    objects = SimpleNamespace(
+        single_camera=False, smoothed=smoothed, numbers=[], errors=errors, milliseconds=0, frames=1
+    )
+    objects_table(cast("MovingObjects", objects), asked, given.shifted(0.06))
+    assert len(found) == 2
+    for times_ns in found:
+        np.testing.assert_array_equal(times_ns, stamps_ns - 60_000_000)
 
 
 # --- parts ---------------------------------------------------------------------------------------

@@ -13,6 +13,7 @@ import time
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -29,14 +30,17 @@ from slam_graph.config import load_config
 from slam_graph.datasets.dataset_registry import open_dataset
 from slam_graph.errors import ConfigError, DataError
 from slam_graph.evaluation.absolute_pose_error import ape
+from slam_graph.experiment import tasks
 from slam_graph.experiment.comparison import compare as compare_algorithms
 from slam_graph.experiment.comparison_figures import binned_mean
 from slam_graph.experiment.comparison_plan import load_configs, plan, with_variants
 from slam_graph.experiment.comparison_results import ALIGNMENTS, read_result
 from slam_graph.experiment.executors import ONE_THREAD, DaskCluster, LocalProcesses
 from slam_graph.experiment.tasks import RecordTask, RunTask, find_sources
+from slam_graph.frontend import Frontend, build_frontend
 from slam_graph.pipeline.run_recording import run as run_pipeline
 from slam_graph.results.metrics import peak_memory_mb
+from slam_graph.sensors import Rig
 from slam_graph.simulation.simulator import simulate
 
 COMMAND = [sys.executable, "-m", "slam_graph.cli.main", "compare"]
@@ -386,6 +390,41 @@ def long_flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return flight(tmp_path_factory.mktemp("long") / "flight", 0, 60.0)
 
 
+def test_tracks_are_made_anew_for_another_gravity_or_without_the_imu(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The front end predicts by the IMU where a run does."""
+    (source,) = find_sources(["sim:figure8"], 0.5, ["tracks.features=20"])
+
+    def task(*overrides: str) -> RecordTask:
+        config = load_config(None, overrides)
+        return RecordTask(source=source, seed=0, config=config, root=tmp_path)
+
+    constant = task("backend.dynamics.model=constant_velocity")
+    moon = task("backend.noise.gravity=1.6")
+    assert len({task().folder, constant.folder, moon.folder}) == 3
+    assert task("backend.noise.pixel_sigma=2").folder == task().folder
+    given: list[tuple[bool, float]] = []
+    samples: list[int] = []
+
+    def build(rig: Rig, *rest: Any) -> Frontend:
+        given.append((rig.has_imu, rest[-1]))
+        frontend = build_frontend(rig, *rest)
+        track = frontend.track
+        frontend.track = lambda frame, imu: samples.append(len(imu)) or track(frame, imu)
+        return frontend
+
+    monkeypatch.setattr(tasks, "build_frontend", build)
+    for each in (task(), moon, constant):
+        samples.clear()
+        each.do()
+        assert (max(samples) > 0) == (each is not constant)
+    assert [imu for imu, _ in given] == [True, True, False]
+    assert given[1][1] == 1.6
+    recorded = open_dataset(constant.folder)
+    assert recorded.info().imu_samples > 0, "the recording has them all the same"
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("by", [signal.SIGINT, signal.SIGKILL], ids=["ctrl_c", "killed"])
 def test_processes_that_workers_have_started_end_with_the_command(
@@ -462,6 +501,8 @@ def test_compare_from_python(here: None, tmp_path: Path) -> None:
     )
     assert second.skipped == 2
     assert told == ["tracks of sim_figure8, seed 5", "swf on sim_figure8, seed 5"]
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    assert summary["runs"] == [f"runs/sim_figure8_seed{seed}/swf" for seed in (4, 5)]
 
 
 @pytest.mark.slow

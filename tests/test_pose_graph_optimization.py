@@ -214,3 +214,31 @@ def test_gnc_keeps_suspected_odometry_connected() -> None:
     solution = optimize_pose_graph(broken, by(robust="gnc", trust_odometry=False))
     assert solution.weights[10] < 0.5
     assert distance(solution.poses, clean) < 0.1
+
+
+@pytest.mark.parametrize("ids", [1, 100])
+def test_an_edge_between_two_sessions_is_no_odometry(ids: int) -> None:
+    """Their ids are apart, whether they count poses or are times."""
+    graph, _ = laps(2, 0.02)
+    keys = ids * np.arange(60)
+    keys[30:] += 20 * ids
+    shifted = graph.measured.translations.copy()
+    shifted[29] += 5.0
+    sessions = replace(graph, keys=keys, measured=Poses(graph.measured.rotations, shifted))
+    assert np.flatnonzero(graph.is_odometry).tolist() == list(range(59))
+    assert np.flatnonzero(~sessions.is_odometry[:59]).tolist() == [29]
+    solution = optimize_pose_graph(sessions, by(robust="gnc"))
+    assert solution.weights[29] < 0.5
+    assert distance(solution.poses, optimize_pose_graph(graph).poses) < 0.1
+
+
+def test_consecutive_poses_need_not_have_consecutive_ids() -> None:
+    """They may be times, of which a few are missing."""
+    graph, _ = laps(2, 0.02)
+    rng = np.random.default_rng(0)
+    times = np.cumsum(rng.integers(40_000_000, 100_000_000, 60))
+    assert replace(graph, keys=times).is_odometry.sum() == 59
+    diagnostics = Diagnostics()
+    poses = initialize(replace(graph, keys=times), "lago", diagnostics)
+    assert not diagnostics.counts
+    assert distance(poses, initialize(graph, "lago", diagnostics)) == 0.0

@@ -2,10 +2,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Recordings for Rerun, read back by Rerun: what is promised is in them, at its times."""
 
+import json
 import logging
 from collections import Counter
 from dataclasses import dataclass, field
 from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
 
 import gtsam
 import numpy as np
@@ -19,7 +22,9 @@ from typer.testing import CliRunner
 
 import slam_graph as sg
 from slam_graph.bundle_adjustment import adjust_bundle, read_bal
+from slam_graph.cli import view_files
 from slam_graph.cli.main import app
+from slam_graph.errors import DataError
 from slam_graph.pose_graph import optimize_pose_graph
 from slam_graph.results import BalResult, RunResult
 from slam_graph.visualization import RerunRecording
@@ -214,6 +219,32 @@ def test_every_run_is_judged_by_its_own_truth(tmp_path: Path) -> None:
     assert "different recordings" in refused(*days, "--output", tmp_path / "no.rrd")
 
 
+def test_runs_of_an_earlier_comparison_are_not_shown(tmp_path: Path) -> None:
+    """They stay beside those of a later one with the same data."""
+    for name in ("ekf", "msckf"):
+        file = tmp_path / "runs" / "flight_seed0" / f"{name}.npz"
+        file.parent.mkdir(parents=True, exist_ok=True)
+        np.savez(file, path=np.ones((4, 3)))
+    shown: list[list[str]] = []
+    recording = SimpleNamespace(show_comparison=lambda runs, *_: shown.append(list(runs)))
+    for summary in ({}, {"runs": ["runs/flight_seed0/msckf"]}):
+        (tmp_path / "summary.json").write_text(json.dumps(summary))
+        show = view_files.of_folder(tmp_path)
+        assert show is not None
+        show(cast(RerunRecording, recording))
+    assert shown == [["ekf", "msckf"], ["msckf"]]
+    (tmp_path / "summary.json").write_text('{"runs": [')
+    with pytest.raises(DataError, match=r"summary\.json: not the summary of a comparison"):
+        view_files.of_folder(tmp_path)
+
+
+def test_files_are_replaced_only_if_that_is_asked_for(tmp_path: Path) -> None:
+    for option, name in (("--output", "a.rrd"), ("--screenshot", "a.png")):
+        (tmp_path / name).write_text("kept")
+        assert "exists already" in refused(tmp_path, option, tmp_path / name)
+        assert (tmp_path / name).read_text() == "kept"
+
+
 def test_an_optimised_bundle_is_seen_before_and_after_from_its_files(tmp_path: Path) -> None:
     file = Path(gtsam.__file__).parent / "Data" / "dubrovnik-3-7-pre.txt"
     BalResult(sg.BalPolicy(), adjust_bundle(read_bal(file))).save(tmp_path / "bundle")
@@ -245,7 +276,7 @@ def test_colours_of_algorithms_are_those_of_the_pictures() -> None:
 def viewed(tmp_path: Path, *what: Path | str) -> Content:
     """What `slam-graph view` saves."""
     path = tmp_path / "viewed.rrd"
-    done = CliRunner().invoke(app, ["view", *map(str, what), "--output", str(path)])
+    done = CliRunner().invoke(app, ["view", *map(str, what), "--output", str(path), "--force"])
     assert done.exit_code == 0, done.exception
     return content(path)
 

@@ -5,6 +5,7 @@
 import json
 import os
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -15,6 +16,7 @@ from typer.testing import CliRunner
 
 import slam_graph as sg
 from slam_graph.cli.main import app
+from slam_graph.datasets.calibration.kalibr_calibration import write_kalibr
 from slam_graph.errors import ConfigError, DataError
 from slam_graph.results.scene import Scene, SceneImage
 from slam_graph.results.scene_files import write_colmap
@@ -105,6 +107,40 @@ def test_images_have_the_poses_that_were_asked_for(
     assert len(texts) == 2
     with pytest.raises(DataError, match="no trajectory of the kind 'loop'"):
         sg.load_result(plain).export(tmp_path, sg.open_dataset(flight), which="loop")
+
+
+def test_poses_of_images_are_those_of_the_calibration_at_the_end(
+    flight: Path, result: Path, tmp_path: Path
+) -> None:
+    """A clock that was corrected and a mounting and focal length that were estimated."""
+    plain = shutil.copytree(result, tmp_path / "plain")
+    (plain / "map.slam").unlink()
+    rig, trajectory = sg.load_result(plain).rig, sg.load_result(plain).best_trajectory
+    first = rig.cameras[0]
+    turned = first.body_T_camera.compose(gtsam.Pose3(gtsam.Rot3.Rx(0.03), np.zeros(3)))
+    camera = replace(first.camera, fx=first.camera.fx + 5.0)
+    estimated = replace(first, camera=camera, body_T_camera=turned, time_offset_s=0.06)
+    write_kalibr(replace(rig, cameras=(estimated,)), plain / "calibration_estimated.yaml")
+    sg.load_result(plain).export(tmp_path / "scene", sg.open_dataset(flight), ["colmap"])
+    model = tmp_path / "scene" / "sparse" / "0"
+    assert float(rows(model / "cameras.txt")[0][4]) == pytest.approx(camera.fx)
+    images = [line for line in rows(model / "images.txt") if line and line[-1].endswith(".png")]
+    assert len(images) > 5
+    for _, *numbers, _, name in images:
+        stamp_ns = int(Path(name).stem) + 60_000_000
+        q, t = numbers[:4], np.array(numbers[4:7], float)
+        camera_T_world = gtsam.Pose3(gtsam.Rot3.Quaternion(*map(float, q)), t)
+        expected = trajectory.at(stamp_ns).compose(turned)
+        assert camera_T_world.inverse().equals(expected, 1e-6)
+
+
+def test_two_formats_are_not_written_into_one_file(tmp_path: Path) -> None:
+    (tmp_path / "folder").mkdir()
+    other = tmp_path / "folder" / ".." / "poses"
+    words = ("export", tmp_path, "--euroc", tmp_path / "poses", "--kitti", other)
+    refused = CliRunner().invoke(app, [*map(str, words)]).exception
+    assert isinstance(refused, ConfigError)
+    assert "--kitti and --euroc name the same file" in str(refused)
 
 
 def references(model: Path) -> tuple[set[tuple[int, int, int]], set[tuple[int, int, int]]]:

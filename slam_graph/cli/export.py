@@ -98,6 +98,7 @@ def export(
     if recording is None:
         given = recording_options(format_, calibration, None, sources)
         refuse_ignored(given, "is for the recording of the run: name it by --recording DATA")
+    _refuse_equal(files)
     for path in files.values():
         ResultFolder.refuse_to_replace(path, force)
     saved = load_result(result)
@@ -112,6 +113,21 @@ def export(
         wanted = [name for name, path in scenes.items() if path == folder]
         for file in saved.export(folder, sequence, wanted, spacing, which):
             typer.echo(str(file))
+
+
+def _refuse_equal(files: dict[str, Path]) -> None:
+    """Refuse one file for two formats: the second would replace the first.
+
+    Raises:
+        ConfigError: naming the two options.
+    """
+    from slam_graph.errors import ConfigError
+
+    taken: dict[Path, str] = {}
+    for name, path in files.items():
+        other = taken.setdefault(path.resolve(), name)
+        if other != name and not (path.exists() and not path.is_file()):  # to devices both go
+            raise ConfigError(f"--{other} and --{name} name the same file, {path}; give two names")
 
 
 def _chosen(saved: SavedRun, which: Which) -> Trajectory:

@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 from contextlib import ExitStack
+from itertools import chain, count
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -65,14 +66,23 @@ def run(
     start: Start = None,
     duration: Duration = None,
     picture: Annotated[
-        Path, typer.Option("--picture", help="PNG of the middle frame with its tracks.")
-    ] = Path("tracks.png"),
+        Path | None,
+        typer.Option(
+            "--picture",
+            help="PNG of the middle frame with its tracks; tracks.png, or tracks-2.png and so on "
+            "where that exists, if not given.",
+            show_default=False,
+        ),
+    ] = None,
     video: Annotated[
         Path | None, typer.Option("--video", help="MP4 of all frames with their tracks.")
     ] = None,
     record: Annotated[
         Path | None, typer.Option("--record", help="Folder to record the tracks to, for replay.")
     ] = None,
+    force: Annotated[
+        bool, typer.Option("--force", help="Let --picture and --video replace files.")
+    ] = False,
     format_: Format = None,
     calibration: Calibration = None,
     groundtruth: Groundtruth = None,
@@ -82,7 +92,12 @@ def run(
     """Track a recording, report how good the tracks are, and draw them."""
     from slam_graph.config import load_config
     from slam_graph.experiment import FrontendReport
+    from slam_graph.results import ResultFolder
 
+    for path in (picture, video):
+        if path is not None:
+            ResultFolder.refuse_to_replace(path, force)
+    picture = picture or _free_name(Path("tracks.png"))
     settings = load_config(config, set_ or (), cameras=cameras, start_s=start, duration_s=duration)
     sequence = open_recording(data, format_, calibration, groundtruth, sources, settings.cameras)
     with ExitStack() as stack:
@@ -139,6 +154,12 @@ def compare(
         echo_json([_plain(report) for report in reports])
     else:
         echo_table([_COLUMNS, *map(_row, reports)])
+
+
+def _free_name(path: Path) -> Path:
+    """The path, or the first with a number behind its name under which there is no file."""
+    numbered = (path.with_stem(f"{path.stem}-{number}") for number in count(2))
+    return next(found for found in chain([path], numbered) if not found.exists())
 
 
 def _settings_of(names: Iterable[str]) -> dict[str, list[str]]:

@@ -73,6 +73,9 @@ def view(
             help="Recording of the run: adds its images or tracks and its IMU samples.",
         ),
     ] = None,
+    force: Annotated[
+        bool, typer.Option("--force", help="Let --output and --screenshot replace files.")
+    ] = False,
     rerun_address: RerunAddress = None,
     format_: Format = None,
     calibration: Calibration = None,
@@ -86,6 +89,7 @@ def view(
     as it was then, unless --map, --recording or --no-images ask for its files.
     """
     from slam_graph.errors import ConfigError
+    from slam_graph.results import ResultFolder
 
     if output is not None and output.suffix != _RRD:
         raise ConfigError(f"--output {output}: a recording for Rerun ends with {_RRD}")
@@ -94,6 +98,9 @@ def view(
     pixels = _size(size)
     if screenshot is not None:
         _check_picture(screenshot)
+    for path in (output, screenshot):
+        if path is not None:
+            ResultFolder.refuse_to_replace(path, force)
     if mode != "connect":
         refuse_ignored({"--rerun-address": rerun_address}, "is for --rerun connect")
     options = (format_, calibration, groundtruth, sources)

@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import csv
+import json
 import zlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -193,7 +194,7 @@ def _run(folder: Path, options: RunOptions) -> _Show:
     # the log is for reading: what is damaged in it is seen, and costs nothing else
     lines = log.read_text("utf-8", errors="replace").splitlines() if log.is_file() else []
     # paths and points can be shown without the cameras
-    rig = saved.rig if (folder / "calibration.yaml").is_file() else None
+    rig = saved.estimated_rig if (folder / "calibration.yaml").is_file() else None
     by_frame = saved.by_frame
     return lambda recording: recording.show_run(
         saved,
@@ -214,7 +215,7 @@ def _comparison(folder: Path) -> _Show:
 
     from slam_graph.errors import DataError
 
-    files = sorted((folder / "runs").glob("*/*.npz"))
+    files = _series_of_comparison(folder)
     runs: dict[str, dict[str, FloatArray]] = {}
     true_path: FloatArray | None = None
     for file in files:
@@ -237,6 +238,25 @@ def _comparison(folder: Path) -> _Show:
         raise DataError(f"{folder}: nothing to show: no run has a path")
     true_paths = {} if true_path is None else {"ground truth": true_path}
     return lambda recording: recording.show_comparison(runs, true_paths)
+
+
+def _series_of_comparison(folder: Path) -> list[Path]:
+    """The series of the runs of a comparison, and of no earlier one in the same folder.
+
+    Raises:
+        DataError: if its summary is damaged.
+    """
+    from slam_graph.errors import DataError
+
+    path = folder / "summary.json"
+    try:
+        table = json.loads(path.read_text(encoding="utf-8"))
+        names = table.get("runs")
+        if names is None:  # of an earlier version
+            return sorted((folder / "runs").glob("*/*.npz"))
+        return [folder / f"{name}.npz" for name in names]
+    except (*_DAMAGED, RecursionError) as error:
+        raise DataError(f"{path}: not the summary of a comparison ({error})") from error
 
 
 def _numbers(series: Mapping[str, Any], name: str, width: int) -> FloatArray:

@@ -82,11 +82,25 @@ def write_report(comparison: Comparison) -> None:
     folder.text("report.html", [_html(comparison, rows, figures)])
     folder.json(
         "summary.json",
-        {"rows": rows, "failures": comparison.failures, "versions": _versions(comparison)},
+        {
+            "rows": rows,
+            "runs": _runs_done(comparison),
+            "failures": comparison.failures,
+            "versions": _versions(comparison),
+        },
     )
     cells = [(str(row["data"]), *_cells(row)) for row in rows]
     comparison.rows, comparison.table = rows, [("data", *_COLUMNS), *cells]
     comparison.files = folder.files
+
+
+def _runs_done(comparison: Comparison) -> list[str]:
+    """The results that the report is of, without suffix and relative to its folder.
+
+    Those of earlier comparisons may lie beside them.
+    """
+    done = (task.result for task in comparison.runs if task.is_done())
+    return [path.relative_to(comparison.folder).with_suffix("").as_posix() for path in done]
 
 
 def _versions(comparison: Comparison) -> dict[str, str]:

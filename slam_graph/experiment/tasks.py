@@ -16,6 +16,7 @@ import shutil
 import stat
 import sys
 from collections.abc import Iterable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -39,6 +40,7 @@ from slam_graph.frontend import build_frontend
 from slam_graph.interrupts import Interrupts
 from slam_graph.pipeline import run
 from slam_graph.results import ResultFolder
+from slam_graph.sensors import ImuData
 from slam_graph.settings import ConfigTree, Settings
 from slam_graph.simulation import SimulationConfig, simulate
 from slam_graph.version import __version__
@@ -209,7 +211,8 @@ class RecordTask(Settings):
     source: Source
     seed: int
     config: RunConfig
-    """Only front end, cameras, start, duration and `objects.enabled` matter."""
+    """Only front end, cameras, start, duration, `objects.enabled`, gravity, and whether the IMU is
+    used matter."""
     root: Path
     """Folder of all tracks."""
 
@@ -224,6 +227,8 @@ class RecordTask(Settings):
         config = self.config.model_dump(
             mode="json", include={"frontend", "cameras", "start_s", "duration_s"}
         )
+        backend = self.config.backend
+        config |= {"gravity": backend.noise.gravity, "dynamics": backend.dynamics.model}
         if self.config.objects.enabled:
             config["objects"] = True
         key = settings_hash(self.source.identity(), config, self.seed, __version__)
@@ -252,8 +257,9 @@ class RecordTask(Settings):
         start_ns = info.start_ns + round(config.start_s * 1e9)
         length_s = config.duration_s
         end_ns = None if length_s is None else start_ns + round(length_s * 1e9)
+        used = config.backend.dynamics.uses_imu(sequence.rig.has_imu and info.imu_samples > 0)
         frontend = build_frontend(
-            sequence.rig,
+            replace(sequence.rig, has_imu=used),
             config.used_frontend,
             self.seed,
             sequence.diagnostics,
@@ -268,7 +274,7 @@ class RecordTask(Settings):
             self.folder, sequence.rig, self.source.name, truth, start, notes
         ) as recorder:
             for packet in sequence.packets(start_ns if config.start_s > 0 else None, end_ns):
-                features = frontend.track(packet.frame, packet.imu)
+                features = frontend.track(packet.frame, packet.imu if used else ImuData.empty())
                 features = features if labels is None else labels.labelled(features)
                 recorder.write(packet.imu, features, packet.aiding)
 

@@ -27,7 +27,7 @@ from slam_graph.maps import MapLocalizer, MapRecording, SlamMap, build_map
 from slam_graph.pipeline.stage import COMPLETED, EstimatedFrame, Stage, warn_on_failure
 from slam_graph.pose_graph import Poses
 from slam_graph.results import RunInput, RunResult
-from slam_graph.sensors import FeatureFrame, Rig
+from slam_graph.sensors import FeatureFrame
 
 NOT_RECOGNISABLE = "nothing to recognise places by: no images, and tracks without descriptors"
 
@@ -68,11 +68,6 @@ def require_places(sequence: Sequence, asked: RunInput, known_map: SlamMap | Non
         raise DataError(f"{asked.info.name}: cannot {purpose}, {NOT_RECOGNISABLE}; {_REMEDY}")
 
 
-def _rig_of(result: RunResult) -> Rig:
-    """The best calibration available."""
-    return result.logs.calibration.rig(result.causal_rig)
-
-
 class Keyframes(Stage):
     """Collects the keyframes that loop closure and map need, with their descriptors.
 
@@ -98,7 +93,7 @@ class Keyframes(Stage):
         began = time.perf_counter()
         # the state's time is on the IMU's clock, also where the camera's time offset is estimated
         features = FeatureFrame(state.stamp_ns, frame.features.cameras)
-        self._log.rig = _rig_of(self._result)
+        self._log.rig = self._result.estimated_rig
         self._log.add(features, state.world_T_body, frame.image)
         self.seconds += time.perf_counter() - began
 
@@ -150,7 +145,7 @@ class LoopClosing(Stage):
         with warn_on_failure(self._diagnostics, "loop_closure_failed", "no loops are closed"):
             closures = close_loops(
                 self._keyframes.at(result.best_trajectory),
-                _rig_of(result),
+                result.estimated_rig,
                 result.config.loop_closure,
                 result.config.seed,
                 self._diagnostics,
@@ -206,7 +201,7 @@ def _build(result: RunResult, keyframes: Keyframes) -> SlamMap:
     causal ones.
     """
     config, loops = result.config, _accepted_loops(result)
-    recording = MapRecording(result.input.info.name, "causal", _rig_of(result))
+    recording = MapRecording(result.input.info.name, "causal", result.estimated_rig)
     if loops and result.loops is not None:
         recording, poses = replace(recording, poses="loop_closed"), result.loops.poses
     elif result.final_ba is not None:
@@ -288,7 +283,7 @@ class Localization(Stage):
         if seen.descriptors is None or len(seen) == 0:
             return None
         unknown = np.full((len(seen), 3), np.nan)
-        rig = _rig_of(self._result)
+        rig = self._result.estimated_rig
         features = FeatureFrame(state.stamp_ns, frame.features.cameras)
         posed = PosedFrame.of(features, tuple(self._last), rig)
         return Keyframe(

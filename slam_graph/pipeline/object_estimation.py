@@ -116,7 +116,7 @@ class Objects(NoObjects):
         if result.final_ba is not None:
             with warn_on_failure(self._diagnostics, "objects_failed", _NOT_SMOOTHED):
                 self._recording.close()
-                rig = result.logs.calibration.rig(result.causal_rig)
+                rig = result.estimated_rig
                 task = self._objects, rig, result.final_ba, result.config.final_ba
                 result.final_ba, failures = self._smoother.smooth(*task)
                 for failure in failures:

@@ -231,13 +231,13 @@ class Verdict(Stage):
     def _quick_look(self) -> Diagnosis | None:
         """A quick look at what was recorded so far; None if it failed."""
         with warn_on_failure(self._diagnostics, "diagnosis_failed", "the cause is not looked for"):
-            return self._nearby(self._final_rig())
+            return self._nearby(self._result.estimated_rig)
         return None
 
     def _refuse_if_ruined(self, look: Diagnosis | None) -> None:
         """Raise DataError if a quick look shows a fault that makes the estimate worth nothing."""
         if look is not None and look.setup_faults:
-            self._refuse("the estimate is wrong", self._final_rig(), _ruins)
+            self._refuse("the estimate is wrong", self._result.estimated_rig, _ruins)
 
     def _refuse(self, why: str, rig: Rig, matters: _Matters) -> None:
         """Raise DataError if what the run was given is certainly wrong, where that matters."""
@@ -273,7 +273,7 @@ class Verdict(Stage):
             contradictions: what shows in the run itself, if that is beyond doubt.
             clocks: a change of the time offset, if there is one.
         """
-        found = self._diagnosed(self._result.input.rig if failed else self._final_rig())
+        found = self._diagnosed(self._result.input.rig if failed else self._result.estimated_rig)
         certain = failed or clocks is not None or not found.setup_faults or self._is_confirmed()
         if clocks is not None:
             found = found.with_clocks(clocks)
@@ -300,8 +300,8 @@ class Verdict(Stage):
         A board that moves before the camera looks like another mounting, focal length or clock.
         """
         with warn_on_failure(self._diagnostics, "diagnosis_failed", "faults are not confirmed"):
-            frames = self._kept.used_frames
-            used = self._of_tracks(self._final_rig(), frames, self._kept.imu) if frames else None
+            frames, rig = self._kept.used_frames, self._result.estimated_rig
+            used = self._of_tracks(rig, frames, self._kept.imu) if frames else None
             return used is None or bool(used.setup_faults)
         return True
 
@@ -340,10 +340,6 @@ class Verdict(Stage):
         offset_ns = round(self._result.causal_rig.pose_offset_s * 1e9)
         return [(a - offset_ns, b - offset_ns) for a, b in self._result.segments.losses]
 
-    def _final_rig(self) -> Rig:
-        """The rig as calibrated, corrected or estimated, whichever came last."""
-        return self._result.logs.calibration.rig(self._result.causal_rig)
-
     def _is_doubtful(self) -> bool:
         """Whether something shows that a good recording hardly ever shows."""
         counts, tested = self._diagnostics.counts, self._result.logs.innovations.columns()
@@ -355,7 +351,7 @@ class Verdict(Stage):
             return True
         changed = self._estimates_objects or self._result.logs.calibration.latest is not None
         if self._looked is None or changed:  # more is known now of calibration or of what moves
-            self._looked = self._nearby(self._final_rig())
+            self._looked = self._nearby(self._result.estimated_rig)
         return bool(self._looked.setup_faults)
 
     def _nearby(self, rig: Rig) -> Diagnosis:

@@ -32,6 +32,10 @@ InformationRepair = Literal["nearest", "isotropic"]
 """What stands in for an information matrix that is not positive definite: the nearest one that is,
 or the isotropic information of its blocks of translation and rotation, as SE-Sync takes it."""
 
+_LONGEST_STEP = 10
+"""Where ids do not count poses, but are times, say: two poses whose ids are farther apart than so
+many usual steps are not consecutive."""
+
 _MAX_STAMP_S = 9_000_000_000
 """Larger ids, taken as seconds, do not fit into nanoseconds."""
 
@@ -121,7 +125,8 @@ class PoseGraph(Displayed):
         rotation_information: whether the information of a 3D rotation belongs to the angle (GTSAM)
             or to the vector part of the quaternion (g2o).
         name: of the graph.
-        odometry: (M,) whether each edge is odometry; those between consecutive poses if not given.
+        odometry: (M,) whether each edge is odometry; those between consecutive poses if not given,
+            which follow each other in the order of ids, without a gap as between two sessions.
             Files do not carry it.
     """
 
@@ -206,7 +211,12 @@ class PoseGraph(Displayed):
         """(M,) whether an edge is odometry; all others are loop closures."""
         if self.odometry is not None:
             return self.odometry
-        consecutive: BoolArray = np.abs(np.diff(self.edges, axis=1))[:, 0] == 1
+        apart = np.abs(np.diff(self.edges, axis=1))[:, 0]
+        steps = np.abs(np.diff(self.keys[self.edges], axis=1))[:, 0]
+        usual = np.median(np.diff(self.keys)) if len(self.keys) > 1 else 1
+        consecutive: BoolArray = (apart == 1) & (
+            steps <= (usual if usual == 1 else _LONGEST_STEP * usual)
+        )
         return consecutive
 
     @cached_property

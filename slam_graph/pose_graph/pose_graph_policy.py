@@ -31,7 +31,7 @@ class PoseGraphCostPolicy(Settings):
     confidence: float = expert(0.99, gt=0, lt=1)
     """χ² quantile of the residuals of inliers."""
     trust_odometry: bool = expert(True)
-    """Whether edges between consecutive poses are never outliers."""
+    """Whether edges between poses with consecutive ids are never outliers."""
 
 
 class PoseGraphStepsPolicy(Settings):

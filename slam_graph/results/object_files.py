@@ -15,6 +15,7 @@ from slam_graph.geometry import Trajectory
 from slam_graph.results.map_output import write_ply
 from slam_graph.results.result_files import ResultFolder
 from slam_graph.results.run_input import RunInput
+from slam_graph.sensors import Rig
 
 if TYPE_CHECKING:
     from slam_graph.backend import MovingObjects
@@ -48,22 +49,30 @@ def save_objects(files: ResultFolder, objects: MovingObjects) -> None:
             files.text(f"objects/{number}_smoothed.tum", path.tum_lines())
 
 
-def _accuracy(errors: _Errors, asked: RunInput) -> dict[str, float | int] | None:
-    """Errors of motions and poses; None without true poses."""
+def _accuracy(errors: _Errors, asked: RunInput, offset_ns: int) -> dict[str, float | int] | None:
+    """Errors of motions and poses, which have the stamps of frames; None without true poses.
+
+    Args:
+        errors: of the objects.
+        asked: the true poses.
+        offset_ns: from stamps of frames to the clock of the true poses.
+    """
     if asked.truth is None or not asked.object_truth:
         return None
-    offset_ns = asked.offset_ns
     true_body = replace(asked.truth, stamps_ns=asked.truth.stamps_ns - offset_ns)
     table: dict[str, float | int] = errors(asked.object_truth, true_body).table()
     return table
 
 
-def objects_table(objects: MovingObjects | None, asked: RunInput) -> dict[str, Any] | None:
+def objects_table(
+    objects: MovingObjects | None, asked: RunInput, rig: Rig
+) -> dict[str, Any] | None:
     """What `metrics.json` says of the objects; None if none were looked for.
 
     Args:
         objects: as they were estimated.
         asked: the true poses, if they are known.
+        rig: the calibration at the end of the run.
     """
     if objects is None:
         return None
@@ -74,7 +83,7 @@ def objects_table(objects: MovingObjects | None, asked: RunInput) -> dict[str, A
             "ms_per_frame": objects.milliseconds / max(objects.frames, 1),
         }
     table: dict[str, Any] = {}
-    smoothed = objects.smoothed
+    smoothed, offset_ns = objects.smoothed, round(rig.pose_offset_s * 1e9)
     for number in objects.numbers:
         states = objects.states(number)
         speeds = [float(np.linalg.norm(state.velocity)) for state in states if state.moving]
@@ -90,8 +99,8 @@ def objects_table(objects: MovingObjects | None, asked: RunInput) -> dict[str, A
         }
     return {
         "objects": table,
-        "accuracy": _accuracy(objects.errors, asked),
-        "smoothed": None if smoothed is None else _accuracy(smoothed.errors, asked),
+        "accuracy": _accuracy(objects.errors, asked, offset_ns),
+        "smoothed": None if smoothed is None else _accuracy(smoothed.errors, asked, offset_ns),
         "ms_per_frame": objects.milliseconds / max(objects.frames, 1),
     }
 

@@ -19,6 +19,7 @@ from slam_graph.bundle_adjustment import BalPolicy, BalSolution
 from slam_graph.display import Displayed
 from slam_graph.files import Files
 from slam_graph.pose_graph import Certificate, PoseGraphPolicy, PoseGraphSolution
+from slam_graph.results.earlier_result import remove_earlier
 from slam_graph.results.map_output import write_ply
 from slam_graph.results.metrics import SCHEMA_VERSION, Table, finite, versions
 from slam_graph.results.result_files import ResultFolder
@@ -93,17 +94,20 @@ class BalResult(Displayed):
     def save(self, folder: Path | str) -> list[Path]:
         """Write all files into a folder, each whole or not at all.
 
+        Files of another result in the folder are removed before (`earlier_result.py`).
+
         Args:
             folder: made if it is missing.
 
         Returns:
             The files, in the order in which they were written.
         """
+        remove_earlier(Path(folder))
         files = ResultFolder(folder)
+        files.json("metrics.json", self.metrics)
         files.text("problem.txt", self.solution.problem_lines())
         files.text("optimized.txt", self.solution.lines())
         files.text("config.yaml", [self.policy.as_yaml()])
-        files.json("metrics.json", self.metrics)
         adjusted = self.solution.adjusted
         write_ply(files.path("scene.ply"), adjusted.points, adjusted.centres())
         with files.appearing("bundle_adjustment.png") as partial:
@@ -197,6 +201,8 @@ class PoseGraphResult(Displayed):
     def save(self, folder: Path | str) -> list[Path]:
         """Write all files into a folder, each whole or not at all.
 
+        Files of another result in the folder are removed before (`earlier_result.py`).
+
         Args:
             folder: made if it is missing.
 
@@ -204,12 +210,13 @@ class PoseGraphResult(Displayed):
             The files, in the order in which they were written.
         """
         solution, graph = self.solution, self.solution.graph
+        remove_earlier(Path(folder))
         files = ResultFolder(folder)
+        files.json("metrics.json", self.metrics)
         files.text("optimized.g2o", solution.g2o_lines())
         files.text("trajectory.tum", graph.trajectory(solution.poses).tum_lines())
         files.text("edges.csv", self._edge_lines())
         files.text("config.yaml", [self.policy.as_yaml()])
-        files.json("metrics.json", self.metrics)
         if self.covariances is not None:
             files.text("covariances.csv", self._covariance_lines(self.covariances))
         if self.certificate is not None:

@@ -16,16 +16,13 @@ import numpy as np
 from slam_graph import evaluation
 from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.config import RunConfig
-from slam_graph.datasets import kalibr_text
 from slam_graph.errors import DataError, EstimationError
 from slam_graph.geometry import AlignmentMode, StateHistory, Trajectory
 from slam_graph.results import metrics as tables
-from slam_graph.results import result_files as names
 from slam_graph.results.free_memory import give_back
 from slam_graph.results.localization_result import LocalizationLog
-from slam_graph.results.map_output import PointMap, save_map, write_ply
-from slam_graph.results.object_files import objects_table, save_objects
-from slam_graph.results.result_files import MAP_NAME, ResultFolder
+from slam_graph.results.map_output import PointMap
+from slam_graph.results.object_files import objects_table
 from slam_graph.results.run_input import Ending, RunInput, Status
 from slam_graph.results.run_logs import RunLogs
 from slam_graph.results.run_picture import (
@@ -77,6 +74,7 @@ class RunResult(RunSummary):
         evidence: statistics of how consistent the run is by itself, by name; None if not judged.
         graphs: factor graphs of the back end by the stamps (ns) of their frames, if asked for.
         warnings: counted faults and rejections.
+        begun: folders that have files of this run already, as `save_so_far` wrote them.
     """
 
     Logs = RunLogs
@@ -100,6 +98,7 @@ class RunResult(RunSummary):
     evidence: Mapping[str, float | None] | None = None
     graphs: dict[int, WindowGraph] = field(default_factory=dict)
     warnings: Counter[str] = field(default_factory=Counter)
+    begun: set[Path] = field(default_factory=set)
 
     def __repr__(self) -> str:
         return (
@@ -142,6 +141,11 @@ class RunResult(RunSummary):
     def causal_rig(self) -> Rig:
         """The calibration that the causal estimate was made with, before any online estimate."""
         return self.corrected_rig or self.input.rig
+
+    @property
+    def estimated_rig(self) -> Rig:
+        """The calibration at the end: as given, corrected at a start, or estimated online."""
+        return self.logs.calibration.rig(self.causal_rig)
 
     @property
     def status(self) -> Status:
@@ -288,9 +292,9 @@ class RunResult(RunSummary):
                 "localization": (
                     None
                     if located is None
-                    else located.table(asked.states_ns[0], logs.frames, asked.truth)
+                    else located.table(asked.start_ns + offset_ns, logs.frames, asked.truth)
                 ),
-                "moving_objects": objects_table(self.objects, asked),
+                "moving_objects": objects_table(self.objects, asked, self.estimated_rig),
                 "nees": tables.consistency_table(
                     truth, self.history, self.start_was_given, self.final_ba
                 ),
@@ -326,52 +330,17 @@ class RunResult(RunSummary):
     def save(self, folder: Path | str) -> list[Path]:
         """Write all files of the run, the trajectory first; each appears whole or not at all.
 
+        Files of another result in the folder are removed before (`earlier_result.py`).
+
         Args:
             folder: made if it is missing.
 
         Returns:
             The files, in the order in which they were written.
         """
-        files = ResultFolder(folder)
-        files.text(names.TRAJECTORY, self.trajectory.tum_lines())
-        files.text(names.STATES, names.state_lines(self.history))
-        files.text(names.SEGMENTS, self.segments.csv_lines(self.trajectory))
-        if len(self.segments) > 1:
-            for number, segment in enumerate(self.segments):
-                part = segment.part_of(self.trajectory)
-                files.text(f"trajectory_segment_{number}.tum", part.tum_lines())
-        if self.final_ba is not None:
-            files.text(names.SMOOTHED, self.final_ba.trajectory.tum_lines())
-            files.text(names.SMOOTHED_STATES, names.state_lines(self.final_ba.history))
-        if self.loops is not None and self.loop_closed is not None:
-            files.text(names.LOOP_CLOSED, self.loop_closed.tum_lines())
-            files.text(names.LOOPS, self.loops.csv_lines())
-            write_ply(files.path("map_loop.ply"), self.loops.points())
-        if self.localization is not None:
-            files.text(names.IN_MAP, self.localization.trajectory().tum_lines())
-            files.text("localization.csv", self.localization.csv_lines())
-        if self.objects is not None:
-            save_objects(files, self.objects)
-        if self.groundtruth is not None:
-            files.text(names.GROUNDTRUTH, self.groundtruth.tum_lines())
-        write_ply(files.path(names.POINTS), self.points)
-        files.text(names.TIMING, self.logs.timing.csv_lines())
-        files.text(names.FRAMES, self.logs.by_frame.csv_lines(self.keyframes_ns, self.nees_series))
-        files.text(names.CONFIG, [self.config.as_yaml()])
-        files.text(names.RIG, [kalibr_text(self.rig)])
-        files.json(names.METRICS, self.metrics)
-        if (calibrated := self.logs.calibration.latest) is not None:
-            files.text("calibration_estimated.yaml", [kalibr_text(calibrated.rig)])
-            files.text("calibration.csv", self.logs.calibration.csv_lines())
-        for stamp_ns, graph in self.graphs.items():
-            for name, text in graph.texts().items():
-                files.text(f"graph_{stamp_ns}_{name}", [text])
-        give_back()  # what the run and the files took: Matplotlib takes 25 MB more
-        with files.appearing("trajectory.png") as partial:
-            self.plot().write(partial)
-        if self.slam_map is not None:  # last: it is the file that a full disk is too small for
-            save_map(self.slam_map, files.path(MAP_NAME), force=True)
-        return files.files
+        from slam_graph.results.run_files import save_run
+
+        return save_run(self, Path(folder))
 
     def save_so_far(self, folder: Path | str, wall_s: float) -> None:
         """Write the estimate of a run that goes on (`slam_graph/results/snapshot.py`)."""

@@ -56,6 +56,11 @@ class RunSummary(Displayed):
 
     @property
     @abstractmethod
+    def estimated_rig(self) -> Rig:
+        """The calibration at the end: as given, corrected at a start, or estimated online."""
+
+    @property
+    @abstractmethod
     def trajectory(self) -> Trajectory:
         """The causal estimate."""
 
@@ -151,9 +156,10 @@ class RunSummary(Displayed):
         for name in formats:
             if name not in SCENE_FORMATS:
                 raise DataError(f"no format '{name}'; {closest(name, SCENE_FORMATS)}")
-        require_models(self.rig)
+        rig = self.estimated_rig
+        require_models(rig)
         trajectory = self.exported_poses(which)[1]
-        parts = SceneParts(self.rig, trajectory, self.points, self._known_map(), spacing_m)
+        parts = SceneParts(rig, trajectory, self.points, self._known_map(), spacing_m)
         scene = export_scene(parts, recording, folder / "images")
         files = []
         if "colmap" in formats:

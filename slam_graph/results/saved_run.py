@@ -113,6 +113,15 @@ class SavedRun(RunSummary):
         return read_kalibr(self.folder / names.RIG)
 
     @cached_property
+    def estimated_rig(self) -> Rig:
+        """The calibration at the end: as given, corrected at a start, or estimated online."""
+        path = self.folder / names.ESTIMATED_RIG
+        if not path.is_file():
+            return self.rig
+        # files of earlier versions have one camera more where depth is measured
+        return replace(self.rig, cameras=read_kalibr(path).cameras[: len(self.rig.cameras)])
+
+    @cached_property
     def trajectory(self) -> Trajectory:
         """The causal estimate, with velocities and biases."""
         return self._with_states(names.TRAJECTORY, names.STATES)

@@ -52,7 +52,7 @@ class SceneParts:
     """What is needed of a run.
 
     Attributes:
-        rig: calibration before the run.
+        rig: calibration at the end of the run.
         trajectory: poses of the body, in the world of the map if there is one.
         points: (P, 3) features in the world, m.
         known: the map of the run, if there is one; it takes the place of rig and points.

@@ -7,15 +7,19 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-from slam_graph.datasets import kalibr_text
 from slam_graph.results import result_files as names
 from slam_graph.results.free_memory import give_back
-from slam_graph.results.map_output import PointMap, write_ply
+from slam_graph.results.map_output import PointMap
 from slam_graph.results.result_files import ResultFolder
+from slam_graph.results.run_files import (
+    GOES_ON,
+    begin_folder,
+    save_causal,
+    save_frames,
+    save_rigs,
+)
 from slam_graph.results.run_input import Ending
 from slam_graph.results.run_result import RunResult
-
-_MESSAGE = "the run goes on, or was ended before its files were complete"
 
 
 def save_so_far(result: RunResult, folder: Path, wall_s: float) -> None:
@@ -31,9 +35,10 @@ def save_so_far(result: RunResult, folder: Path, wall_s: float) -> None:
     Raises:
         DataError: if a file cannot be written.
     """
-    now = replace(result, ending=Ending("unfinished", _MESSAGE, None, wall_s), point_map=PointMap())
+    ending = Ending("unfinished", GOES_ON, None, wall_s)
+    now = replace(result, ending=ending, point_map=PointMap())
     try:
-        _write(now, ResultFolder(folder))
+        _write(now, begin_folder(now, folder))
     finally:
         del now
         give_back()
@@ -43,12 +48,6 @@ def _write(now: RunResult, files: ResultFolder) -> None:
     """The files that there are of an unfinished run."""
     files.json(names.METRICS, now.metrics)
     files.text(names.CONFIG, [now.config.as_yaml()])
-    files.text(names.RIG, [kalibr_text(now.rig)])
-    files.text(names.TRAJECTORY, now.trajectory.tum_lines())
-    files.text(names.STATES, names.state_lines(now.history))
-    files.text(names.SEGMENTS, now.segments.csv_lines(now.trajectory))
-    if now.groundtruth is not None:
-        files.text(names.GROUNDTRUTH, now.groundtruth.tum_lines())
-    write_ply(files.path(names.POINTS), now.points)
-    files.text(names.TIMING, now.logs.timing.csv_lines())
-    files.text(names.FRAMES, now.logs.by_frame.csv_lines(now.keyframes_ns, now.nees_series))
+    save_rigs(now, files)
+    save_causal(now, files)
+    save_frames(now, files)
