@@ -91,6 +91,36 @@ def test_positions_without_extent_cannot_be_aligned(mode: str) -> None:
         Similarity.of_positions(still, still, mode)
 
 
+@pytest.mark.parametrize("mode", ["se3", "sim3", "yaw"])
+@pytest.mark.parametrize("seed", range(4))
+def test_what_stands_is_not_aligned_by_noise(mode: str, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    truth, still = rng.normal(size=(200, 3)) * 1e-4, rng.normal(size=(200, 3)) * 1e-3
+    with pytest.raises(DataError, match="cannot align"):
+        Similarity.of_positions(truth, still, mode)
+    Similarity.of_positions(truth, still, mode, doubtful=True)
+
+
+@pytest.mark.parametrize("mode", ["se3", "sim3", "yaw"])
+def test_a_short_way_is_aligned_in_spite_of_noise(mode: str) -> None:
+    rng = np.random.default_rng(0)
+    angles = np.linspace(0.0, 2.0, 10)
+    truth = 3e-3 * np.column_stack([np.cos(angles), np.sin(angles), angles])
+    turned = truth @ Rotation.from_euler("z", 0.5).as_matrix()
+    found = Similarity.of_positions(truth, turned + rng.normal(size=(10, 3)) * 3e-4, mode)
+    assert Rotation.from_matrix(found.rotation).as_rotvec() == pytest.approx([0, 0, 0.5], abs=0.3)
+
+
+def test_a_line_with_noise_has_no_roll_and_its_yaw_is_known() -> None:
+    rng = np.random.default_rng(1)
+    way = np.column_stack([np.linspace(0.0, 5.0, 300), np.zeros((300, 2))])
+    truth, estimate = (way + rng.normal(size=(300, 3)) * 1e-3 for _ in range(2))
+    with pytest.raises(DataError, match="cannot align"):
+        Similarity.of_positions(truth, estimate, "se3")
+    found = Similarity.of_positions(truth, estimate, "yaw")
+    assert Rotation.from_matrix(found.rotation).magnitude() < 1e-3
+
+
 def test_nearest_agrees_with_brute_force() -> None:
     rng = np.random.default_rng(0)
     for count in (1, 2, 50):

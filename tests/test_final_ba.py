@@ -3,11 +3,12 @@
 """The bundle adjustment over a whole recording: exact, complete, never in the way."""
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+import gtsam
 import numpy as np
 import pytest
 from flight import FISHEYE, rig
@@ -16,6 +17,7 @@ from slam_graph.backend.backend_config import BackendConfig
 from slam_graph.backend.smoothing import final_adjustment
 from slam_graph.backend.smoothing.final_adjustment import FinalBa, adjust_recording, segments
 from slam_graph.backend.smoothing.frame_log import FrameLog
+from slam_graph.backend.smoothing.keyframe_states import state_at
 from slam_graph.backend.smoothing.recording_factors import nearest_keyframe
 from slam_graph.backend.smoothing.smoothing_config import FinalBaConfig
 from slam_graph.config import load_config
@@ -246,6 +248,32 @@ def test_a_failure_leaves_the_causal_estimate_and_one_warning(
     assert len(result.history) > 0
     assert result.final_ba is None
     assert result.warnings["final_ba_failed"] == 1
+
+
+@pytest.mark.parametrize("still_apart", [False, True])
+def test_a_minimum_that_contradicts_the_causal_estimate_does_not_go_unsaid(
+    still_apart: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It is sought again with what fits that estimate; where it does not help, it is said."""
+    adjusted, asked = FinalBa.of_worlds, list[bool]()
+
+    def bent(*arguments: Any) -> FinalBa | None:
+        found = adjusted(*arguments)
+        asked.append(arguments[-1])
+        if found is None or (asked[-1] and not still_apart):
+            return found
+        path, history = found.trajectory, found.history.like()
+        covariance = np.diag(np.full(15, 1e-6))
+        for k in range(len(path)):
+            state = state_at(path, k)
+            pose = state.world_T_body.compose(gtsam.Pose3(gtsam.Rot3(), np.array([0.1 * k, 0, 0])))
+            history.append(replace(state, world_T_body=pose, covariance=covariance))
+        return replace(found, history=history)
+
+    monkeypatch.setattr(FinalBa, "of_worlds", bent)
+    result = run(flight(2, 1.0, duration_s=4.0), min_coverage=0.1)
+    assert asked == [False, True]
+    assert result.warnings["smoothed_contradicts"] == still_apart
 
 
 def test_where_there_is_nothing_to_gain_the_causal_estimate_is_left_alone() -> None:

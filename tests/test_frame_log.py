@@ -77,6 +77,20 @@ def test_features_are_those_of_the_frames(log: FrameLog, packets: list[Packet]) 
     assert begin == len(rows)
 
 
+def test_features_that_move_are_not_read_back(log: FrameLog, packets: list[Packet]) -> None:
+    moving = log.features(FIRST, STOP)[1]["id"][::7]
+    still = log.without(moving[:3]).without(moving)
+    counts, rows = still.part(None, None).features(FIRST, STOP)
+    begin = 0
+    for number, of_frame in enumerate(counts):
+        frame = packets[FIRST + number].frame
+        assert isinstance(frame, FeatureFrame)
+        for seen, count in zip(frame.without(moving).cameras, of_frame, strict=True):
+            assert np.array_equal(rows["id"][begin : begin + count], seen.ids)
+            begin += count
+    assert begin == len(rows) < len(log.features(FIRST, STOP)[1])
+
+
 def test_damaged_features_are_refused(log: FrameLog, packets: list[Packet]) -> None:
     (file,) = log._recorder.path.glob("features.bin")
     kept = file.read_bytes()

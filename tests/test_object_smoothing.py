@@ -11,7 +11,10 @@ import gtsam
 import numpy as np
 import pytest
 
+from slam_graph.arrays import IntArray
 from slam_graph.backend.objects.ego_motion import motion_samples
+from slam_graph.backend.smoothing.final_adjustment import FinalBa
+from slam_graph.backend.smoothing.frame_log import FrameLog
 from slam_graph.backend.smoothing.keyframe_states import with_angular_rates
 from slam_graph.backend.smoothing.object_log import ObjectLog
 from slam_graph.geometry import NavState
@@ -75,6 +78,24 @@ def test_motion_that_is_known_leaves_no_rate_to_estimate() -> None:
     )
     np.testing.assert_allclose(same.gyro_bias, 0.0, atol=1e-9)
     np.testing.assert_allclose(different.gyro_bias, -other, atol=0.02)
+
+
+def test_the_platform_is_adjusted_without_the_tracks_that_move(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    read: list[tuple[IntArray, IntArray]] = []
+
+    def noted(log: FrameLog, *_: object) -> None:
+        rows = log.features(0, len(log.frames_ns))[1]
+        read.append((log.left_out, np.unique(rows["id"])))
+
+    monkeypatch.setattr(FinalBa, "of_worlds", noted)
+    flight = simulate(duration_s=3.0, rate_hz=10.0, seed=3, objects={"count": 1, "masks": True})
+    run(flight, overrides={"objects.enabled": True, "min_coverage": 0.1})
+    ((moved, left),) = read
+    assert len(moved) > 5
+    assert len(left) > 50
+    assert not np.isin(left, moved).any()
 
 
 def flight_of_two(seed: int) -> RunResult:

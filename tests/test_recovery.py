@@ -271,6 +271,11 @@ def test_worlds_that_are_not_joined_are_smoothed_apart() -> None:
         part = segment.part_of(result.smoothed)
         assert result.groundtruth is not None
         assert ape(result.groundtruth, part, alignment="yaw").statistics.rmse < 0.02
+    sigmas, stamps_ns = result.smoothed_sigmas, result.smoothed.stamps_ns
+    assert sigmas is not None
+    later = stamps_ns >= result.segments[1].begin_ns
+    assert sigmas[~later, 3:6].max() < 1.0
+    assert sigmas[later, 3:6].min() > 500.0  # nothing tells where it is
 
 
 def test_a_run_that_is_lost_again_and_again_is_given_up() -> None:

@@ -17,7 +17,7 @@ from slam_graph.arrays import FloatArray
 from slam_graph.backend.backend_config import BackendConfig
 from slam_graph.backend.cost.feature_tracks import Observations
 from slam_graph.backend.smoothing.frame_log import FrameLog
-from slam_graph.backend.smoothing.keyframe_states import states_at
+from slam_graph.backend.smoothing.keyframe_states import in_unknown_world, states_at
 from slam_graph.backend.smoothing.recording_cost import (
     EliminatedFeatures,
     LinearCost,
@@ -41,10 +41,11 @@ from slam_graph.backend.smoothing.state_elimination import (
 )
 from slam_graph.backend.solve.stacked_values import stacked_poses
 from slam_graph.backend.solve.state import dim
-from slam_graph.backend.world_gauge import gauge_motion
+from slam_graph.backend.world_gauge import gauge_motion, with_unknown_gauge
 from slam_graph.config import load_config
 from slam_graph.evaluation.consistency import mean_bounds
 from slam_graph.experiment.tasks import find_sources
+from slam_graph.geometry import NavState, StateHistory
 from slam_graph.pipeline.run_recording import run
 from slam_graph.results.run_result import RunResult
 from slam_graph.simulation.simulation_config import (
@@ -294,3 +295,23 @@ def test_the_noise_of_the_imu_is_found_from_the_residuals(scale: float, tmp_path
     problem.solve()
     found = problem.imu_noise
     np.testing.assert_allclose([found.gyro, found.accel], scale, rtol=0.25)
+
+
+@pytest.mark.parametrize("gauge", [4, 6])
+def test_states_of_a_world_that_nothing_joins_are_as_unknown_as_it(gauge: int) -> None:
+    """The covariances of a history are those that each state has with it."""
+    rng, unknown = np.random.default_rng(gauge), np.diag([1e6] * 3 + [np.pi**2] * (gauge - 3))
+    history, expected = StateHistory(), StateHistory()
+    first = rng.normal(size=3)
+    for k in range(4):
+        place = first if k == 0 else rng.normal(size=3)
+        pose = gtsam.Pose3(gtsam.Rot3.Expmap(rng.normal(size=3)), place)
+        v, accel, gyro = rng.normal(size=(3, 3))
+        covariance = np.diag(rng.uniform(1e-10, 1e-6, 15))
+        state = NavState(k, pose, v, accel_bias=accel, gyro_bias=gyro, covariance=covariance)
+        history.append(state)
+        expected.append(with_unknown_gauge(state, unknown, first))
+    found = in_unknown_world(history, unknown)
+    np.testing.assert_allclose(found.sigmas(), expected.sigmas(), rtol=1e-9)
+    np.testing.assert_allclose(found.pose_covariances(), expected.pose_covariances(), 1e-9, 1e-6)
+    assert in_unknown_world(history, np.zeros((4, 4))) is history

@@ -78,15 +78,26 @@ class Evidence:
     @property
     def is_unusual(self) -> bool:
         """Whether something is beyond what good runs show."""
-        return (self.noise_at_limit or 0.0) > USUAL_NOISE_AT_LIMIT or self._shift > USUAL_SHIFT
+        return (self.noise_at_limit or 0.0) > USUAL_NOISE_AT_LIMIT or not self.agrees
 
     @property
     def contradicts(self) -> bool:
         """Whether both signs say that the run is wrong, so that it is suspect by that alone."""
-        return (self.noise_at_limit or 0.0) > USUAL_NOISE_AT_LIMIT and self._shift > MOST_SHIFT
+        return (self.noise_at_limit or 0.0) > USUAL_NOISE_AT_LIMIT and self.is_apart
 
     @property
-    def _shift(self) -> float:
+    def agrees(self) -> bool:
+        """Whether the smoothed trajectory is as near to the causal one as in good runs."""
+        return self.shift <= USUAL_SHIFT
+
+    @property
+    def is_apart(self) -> bool:
+        """Whether it is so far away that one of the two is wrong."""
+        return self.shift > MOST_SHIFT
+
+    @property
+    def shift(self) -> float:
+        """The larger one of the two shifts, 0 where there is none."""
         return max(self.position_shift or 0.0, self.rotation_shift or 0.0)
 
     @property
@@ -98,9 +109,9 @@ class Evidence:
                 f"images contradict the IMU in {self.noise_at_limit:.0%} of the frames, as with a "
                 "wrong calibration, clock or noise of the IMU"
             )
-        if self._shift > USUAL_SHIFT:
+        if not self.agrees:
             causes.append(
-                f"the smoothed trajectory is {self._shift:.1f} σ away from the causal one, as with "
+                f"the smoothed trajectory is {self.shift:.1f} σ away from the causal one, as with "
                 "a wrong calibration or a wrong start"
             )
         return causes

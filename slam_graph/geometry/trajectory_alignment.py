@@ -22,8 +22,14 @@ from slam_graph.geometry.trajectory import Trajectory
 AlignmentMode = Literal["none", "yaw", "se3", "sim3", "scale"]
 ALIGNMENT_MODES: tuple[AlignmentMode, ...] = get_args(AlignmentMode)
 
+_LEAST_CORRELATION = 0.5
+"""Positions determine a rotation where those of the estimate and of the reference are correlated as
+much as this in the plane that it turns. With less, the part that they do not have in common is 1.7
+times the one that they have, and the angle has a standard deviation of a radian or more, as errors
+along a path are so correlated that only a few count. Something that stands, seen with noise, has
+1/√N; a short way that is seen at all has nearly 1."""
 _RELATIVE_RANK = 1e-14
-"""A singular value below this fraction of the largest one counts as zero."""
+"""A correlation, or a singular value over the largest one, below this counts as zero."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,7 +53,7 @@ class Similarity:
 
     @staticmethod
     def of_positions(
-        reference: FloatArray, estimate: FloatArray, mode: AlignmentMode
+        reference: FloatArray, estimate: FloatArray, mode: AlignmentMode, doubtful: bool = False
     ) -> Similarity:
         """The map of `mode` from the positions of an estimate to those of the reference.
 
@@ -55,6 +61,7 @@ class Similarity:
             reference: (N, 3) positions.
             estimate: (N, 3) positions at the same times.
             mode: `scale` corrects the scale of Sim(3) alone, neither rotation nor translation.
+            doubtful: whether a map will do that is hardly determined, as one to begin with.
 
         Raises:
             DataError: if the mode is unknown, or the positions do not determine the map.
@@ -63,9 +70,10 @@ class Similarity:
             raise DataError(f"unknown alignment '{mode}'; {closest(mode, ALIGNMENT_MODES)}")
         if mode == "none":
             return Similarity.identity()
+        least = 0.0 if doubtful else _LEAST_CORRELATION
         if mode == "yaw":
-            return _align_yaw(reference, estimate)
-        similarity = _umeyama(reference, estimate, with_scale=mode != "se3")
+            return _align_yaw(reference, estimate, least)
+        similarity = _umeyama(reference, estimate, mode != "se3", least)
         if mode == "scale":
             return Similarity(np.eye(3), np.zeros(3), similarity.scale)
         return similarity
@@ -105,7 +113,9 @@ class Similarity:
         )
 
 
-def _umeyama(reference: FloatArray, estimate: FloatArray, with_scale: bool = False) -> Similarity:
+def _umeyama(
+    reference: FloatArray, estimate: FloatArray, with_scale: bool, least: float
+) -> Similarity:
     """The least-squares similarity from the points of an estimate to those of a reference.
 
     Umeyama, "Least-squares estimation of transformation parameters between two point patterns",
@@ -115,15 +125,21 @@ def _umeyama(reference: FloatArray, estimate: FloatArray, with_scale: bool = Fal
         reference: (N, 3) points, N ≥ 3.
         estimate: (N, 3) the same points in another frame.
         with_scale: estimate the scale too (Sim(3)); otherwise it is 1 (SE(3)).
+        least: correlation of the points, along the two axes on which they differ least, with which
+            their rotation about the third is defined.
 
     Raises:
-        DataError: if the points lie on one line or coincide: their rotation is undefined.
+        DataError: if the points lie on one line or coincide, but for what is not the same in both:
+            their rotation is undefined.
     """
     mean_reference, mean_estimate = reference.mean(axis=0), estimate.mean(axis=0)
-    centred = estimate - mean_estimate
-    covariance = (reference - mean_reference).T @ centred / len(reference)
+    centred, wanted = estimate - mean_estimate, reference - mean_reference
+    covariance = wanted.T @ centred / len(reference)
     U, d, Vt = np.linalg.svd(covariance)
-    if len(reference) < 3 or d[1] <= _RELATIVE_RANK * max(float(d[0]), np.finfo(float).tiny):
+    across = (wanted @ U[:, 1:], centred @ Vt[1:].T)
+    common = len(reference) * float(d[1:].sum())  # as well in a mirror, which is no matter of noise
+    is_line = len(reference) < 3 or d[1] <= _RELATIVE_RANK * max(d[0], np.finfo(float).tiny)
+    if is_line or not _determined(common, *across, least):
         raise DataError(
             f"cannot align {len(reference)} positions that lie on one line or coincide; "
             "use --align none or yaw, or a recording that moves"
@@ -135,7 +151,20 @@ def _umeyama(reference: FloatArray, estimate: FloatArray, with_scale: bool = Fal
     return Similarity(rotation, mean_reference - scale * rotation @ mean_estimate, scale)
 
 
-def _align_yaw(reference: FloatArray, estimate: FloatArray) -> Similarity:
+def _determined(common: float, reference: FloatArray, estimate: FloatArray, least: float) -> bool:
+    """Whether points determine the angle about an axis.
+
+    Args:
+        common: Σ r·e of the two in the plane across the axis, at the best angle.
+        reference: (N, 2) the points r in that plane, with a mean of zero.
+        estimate: (N, 2) the same e.
+        least: correlation of the two with which they do.
+    """
+    sizes = float(np.linalg.norm(reference)) * float(np.linalg.norm(estimate))
+    return bool(common > max(least, _RELATIVE_RANK) * sizes)
+
+
+def _align_yaw(reference: FloatArray, estimate: FloatArray, least: float) -> Similarity:
     """The least-squares rotation about world z and translation (4 degrees of freedom).
 
     With C = Σ r eᵀ over centred points, Σ |r - Rz(ψ) e|² is least where
@@ -144,14 +173,18 @@ def _align_yaw(reference: FloatArray, estimate: FloatArray) -> Similarity:
     Args:
         reference: (N, 3) points.
         estimate: (N, 3) the same points in a frame whose z axis is vertical too.
+        least: correlation of the points across the vertical with which their heading is defined.
 
     Raises:
-        DataError: if no point is off the vertical through the mean: the heading is undefined.
+        DataError: if no point is off the vertical through the mean, but for what is not the same in
+            both: the heading is undefined.
     """
     mean_reference, mean_estimate = reference.mean(axis=0), estimate.mean(axis=0)
-    C = (reference - mean_reference).T @ (estimate - mean_estimate)
+    wanted, centred = reference - mean_reference, estimate - mean_estimate
+    C = wanted.T @ centred
     sine, cosine = C[1, 0] - C[0, 1], C[0, 0] + C[1, 1]
-    if np.hypot(sine, cosine) == 0.0:
+    common = float(np.hypot(sine, cosine))
+    if not _determined(common, wanted[:, :2], centred[:, :2], least):
         raise DataError(
             f"cannot align the yaw of {len(reference)} positions above one another; "
             "use --align none, or a recording that moves"

@@ -111,7 +111,7 @@ def run(
     smoothed = result.config.final_ba.enabled
     stages: list[Stage] = [  # in the order in which they finish
         Observers(progress, recorder or NullRecorder()),
-        *([Smoothing(result, progress, diagnostics)] if smoothed else []),
+        *([Smoothing(result, progress, diagnostics, objects)] if smoothed else []),
         objects,  # it moves the smoothed trajectory, too
         *places,
         Verdict(result, diagnostics, objects),

@@ -10,16 +10,26 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from slam_graph import backend
+from slam_graph.arrays import FloatArray
 from slam_graph.diagnostics import Diagnostics
-from slam_graph.errors import SlamGraphError
+from slam_graph.errors import EstimationError, SlamGraphError
 from slam_graph.pipeline.observers import Progress
-from slam_graph.pipeline.stage import COMPLETED, EstimatedFrame, Stage, warn_on_failure
+from slam_graph.pipeline.stage import (
+    COMPLETED,
+    EstimatedFrame,
+    NoObjects,
+    Stage,
+    warn_on_failure,
+)
 from slam_graph.results import RunResult
 
 _SMOOTHED = (*COMPLETED, "diverged")
 """Run statuses after which the recording is bundle adjusted (not after Ctrl-C)."""
 
 _FAILED = "no smoothed trajectory"
+_LEAST_LEFT = 0.6
+"""Features that do not fit the causal trajectory are left out where this part of the observations
+is left: where less is, it may be what is wrong."""
 
 logger = logging.getLogger(__name__)
 
@@ -29,14 +39,21 @@ class Smoothing(Stage):
 
     Whatever goes wrong is counted as a warning; the causal result stays as it is.
 
+    Features that were found to move are left out. Where the minimum is far from the causal
+    trajectory, the adjustment may have taken something that moves for static; then it is done again
+    without the features that do not fit that trajectory.
+
     Args:
         result: of the run; it is given the smoothed trajectory.
         progress: told after each step of the adjustment.
         diagnostics: counts what goes wrong.
+        objects: knows what moves.
     """
 
-    def __init__(self, result: RunResult, progress: Progress, diagnostics: Diagnostics) -> None:
-        self._result = result
+    def __init__(
+        self, result: RunResult, progress: Progress, diagnostics: Diagnostics, objects: NoObjects
+    ) -> None:
+        self._result, self._objects = result, objects
         self._progress = progress
         self._diagnostics = diagnostics
         self._recording = ExitStack()
@@ -81,13 +98,41 @@ class Smoothing(Stage):
 
     def _solve(self, log: backend.FrameLog) -> None:
         result = self._result
+        log = log.without(self._objects.moved)
+        result.final_ba = found = self._adjusted(log)
+        if found is None:
+            return
+        is_apart, causes = self._contradiction(found)
+        if is_apart:
+            again = self._consistent(log, found)
+            result.final_ba = found = again or found
+            if again is None:
+                self._diagnostics.warn("smoothed_contradicts", "; ".join(causes))
+        summary = found.summary
+        logger.info(
+            "final bundle adjustment: %d keyframes, %d features, %d steps in %.1f s",
+            summary.keyframes,
+            summary.features,
+            summary.iterations,
+            summary.seconds,
+        )
+
+    def _adjusted(self, log: backend.FrameLog, consistent: bool = False) -> backend.FinalBa | None:
+        """The adjustment of a log; None if it has too few observations.
+
+        Args:
+            log: all frames.
+            consistent: whether features that do not fit the causal trajectory are left out.
+        """
+        result = self._result
         segments = result.segments
-        parts: list[tuple[int, int | None]] = [
-            (group[0].begin_ns, group[-1].end_ns) for group in segments.worlds()
+        parts: list[tuple[int, int | None, FloatArray]] = [
+            (group[0].begin_ns, group[-1].end_ns, group[0].joint_covariance)
+            for group in segments.worlds()
         ]
         if segments.goes_on:  # the last one has the rest of the recording
-            parts[-1] = parts[-1][0], None
-        result.final_ba = backend.FinalBa.of_worlds(
+            parts[-1] = parts[-1][0], None, parts[-1][2]
+        return backend.FinalBa.of_worlds(
             log,
             result.trajectory,
             parts,
@@ -96,17 +141,47 @@ class Smoothing(Stage):
             result.config.final_ba,
             self._progress.adjusting,
             result.config.objects.enabled,
+            consistent,
         )
-        if result.final_ba is None:
-            return
-        summary = result.final_ba.summary
+
+    def _consistent(self, log: backend.FrameLog, first: backend.FinalBa) -> backend.FinalBa | None:
+        """The adjustment of what fits the causal trajectory, if it agrees with that.
+
+        Args:
+            log: all frames.
+            first: the adjustment with all features.
+        """
+        try:
+            found = self._adjusted(log, consistent=True)
+        except EstimationError as error:
+            logger.info("what fits the causal trajectory has no minimum: %s", error)
+            return None
+        if found is None:
+            return None
+        left = found.summary.observations / max(first.summary.observations, 1)
+        _, causes = self._contradiction(found)
         logger.info(
-            "final bundle adjustment: %d keyframes, %d features, %d steps in %.1f s",
-            summary.keyframes,
-            summary.features,
-            summary.iterations,
-            summary.seconds,
+            "of what fits the causal trajectory %.0f%% is left; %s", 100 * left, causes or "agrees"
         )
+        return found if left >= _LEAST_LEFT and not causes else None
+
+    def _contradiction(self, found: backend.FinalBa) -> tuple[bool, list[str]]:
+        """Whether an adjustment is so far from the causal trajectory that one of them is wrong.
+
+        Without an IMU motion is a guess, whose errors are not white; and in the world of position
+        fixes these tell more of it than the causal covariance does.
+
+        Returns:
+            That, and in words what is beyond the usual; [] if it is as near as in good runs.
+        """
+        from slam_graph.diagnosis import Diagnosis  # it takes a moment to import
+
+        result = self._result
+        if not result.input.rig.has_imu or result.georeferenced:
+            return False, []
+        innovations = result.logs.innovations.columns()
+        evidence = Diagnosis.of_run(innovations, None, result.history, found.history)
+        return evidence.is_apart, evidence.causes
 
     def _give_up(self, error: Exception) -> None:
         self._log = None

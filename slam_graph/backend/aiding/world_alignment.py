@@ -264,7 +264,7 @@ class _Path:
         if len(self.turns) < _MIN_ORIENTATIONS:
             try:
                 found = Similarity.of_positions(
-                    self.fixes, self.places, "yaw" if self.level else "se3"
+                    self.fixes, self.places, "yaw" if self.level else "se3", doubtful=True
                 )
             except DataError:
                 return None

@@ -21,10 +21,16 @@ from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.backend.backend_config import BackendConfig
 from slam_graph.backend.smoothing.adjustment_figures import FinalBaSummary, summary_of, total_of
 from slam_graph.backend.smoothing.adjustment_progress import Report, SegmentProgress
+from slam_graph.backend.smoothing.causal_outliers import causal_outliers
 from slam_graph.backend.smoothing.frame_log import FrameLog
 from slam_graph.backend.smoothing.imu_noise_estimation import ImuNoiseFactors
 from slam_graph.backend.smoothing.keyframe_aiding import aiding_of_keyframes
-from slam_graph.backend.smoothing.keyframe_states import states_at, with_angular_rates
+from slam_graph.backend.smoothing.keyframe_states import (
+    extended_by,
+    in_unknown_world,
+    states_at,
+    with_angular_rates,
+)
 from slam_graph.backend.smoothing.pose_equations import PoseEquations
 from slam_graph.backend.smoothing.recording_problem import BundleAdjustment
 from slam_graph.backend.smoothing.recording_segment import RecordingSegment, read_segment
@@ -89,28 +95,31 @@ class FinalBa:
     def of_worlds(
         log: FrameLog,
         causal: Trajectory,
-        worlds: Sequence[tuple[int, int | None]],
+        worlds: Sequence[tuple[int, int | None, FloatArray]],
         rig: Rig,
         backend: BackendConfig,
         config: FinalBaConfig,
         report: Report,
         joint: bool = False,
+        consistent: bool = False,
     ) -> FinalBa | None:
         """Solve each part of a recording as a whole whose poses are in one world.
 
         Args:
             log: all frames.
             causal: as for `adjust_recording`.
-            worlds: times of the first and the last state of each part, in the order of time; None
-                for the end of the recording. Frames before the first part belong to it.
+            worlds: times of the first and the last state of each part, in the order of time, None
+                for the end of the recording; and the covariance of its gauge in the world of the
+                first (4, 4) or (6, 6), m and rad. Frames before the first part belong to it.
             rig: as for `adjust_recording`.
             backend: noise and triangulation.
             config: settings.
             report: is given the progress after each step.
             joint: as for `adjust_recording`.
+            consistent: whether features that do not fit the causal trajectory are left out.
         """
         parts: list[FinalBa] = []
-        for number, (begin_ns, end_ns) in enumerate(worlds):
+        for number, (begin_ns, end_ns, unknown) in enumerate(worlds):
             inside = causal.stamps_ns >= begin_ns
             if end_ns is not None:
                 inside &= causal.stamps_ns <= end_ns
@@ -121,6 +130,9 @@ class FinalBa:
             )
             try:
                 chosen = causal.select(inside)
+                if consistent:
+                    task = SmoothingTask.of(rig, backend, config)
+                    part = part.without(causal_outliers(part, chosen, task))
                 known = joint and len(worlds) == 1
                 found = adjust_recording(part, chosen, rig, backend, config, report, joint=known)
             except EstimationError as error:
@@ -129,7 +141,8 @@ class FinalBa:
                 logger.warning("part %d of the recording is not smoothed: %s", number, error)
                 continue
             if found is not None:
-                parts.append(found)
+                history = in_unknown_world(found.history, unknown)
+                parts.append(replace(found, history=history))
         if len(parts) < 2:
             return parts[0] if parts else None
         history = parts[0].history.like()
@@ -306,7 +319,7 @@ def _extended_backward(
         solved = BundleAdjustment(start, task, progress.solving).solve()
         _check(solved)
         earlier = [s for s in solved.states if s.stamp_ns < causal.stamps_ns[0]]
-        causal = _concatenated([_trajectory(earlier), causal])
+        causal = extended_by(earlier, causal)
     return causal
 
 
@@ -373,18 +386,3 @@ def _check(solved: AdjustedSegment) -> None:
         raise EstimationError(f"images do not fit: residuals of {found.pixel_residual:.1f} σ")
     if not all(np.isfinite(state.world_T_body.matrix()).all() for state in solved.states):
         raise EstimationError("a pose is not finite")
-
-
-def _trajectory(states: list[NavState]) -> Trajectory:
-    history = StateHistory()
-    for state in states:
-        history.append(state)
-    return history.trajectory()
-
-
-def _concatenated(parts: list[Trajectory]) -> Trajectory:
-    """Trajectories with velocities and biases, concatenated in time."""
-    names = ("stamps_ns", "positions", "quaternions", "velocities", "accel_biases", "gyro_biases")
-    return Trajectory(
-        **{name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
-    )

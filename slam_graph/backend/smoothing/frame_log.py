@@ -67,6 +67,8 @@ class FrameLog:
         georeferenced: whether the causal estimate is in the world of the position fixes.
         fix_offset_s: added to the times of the fixes, beyond the given offset.
         fix_calibration: lever arm and clock of the fixes, where they are variables.
+        left_out: ids (N,) of features that are not read back: those of moving objects, which are
+            known only after some frames.
     """
 
     def __init__(
@@ -90,6 +92,7 @@ class FrameLog:
         self.clock_changes = ClockChanges()
         self.georeferenced, self.fix_offset_s = False, 0.0
         self.fix_calibration: AidingData.Calibration | None = None
+        self.left_out: IntArray = np.zeros(0, np.int64)
 
     @classmethod
     @contextmanager
@@ -209,10 +212,25 @@ class FrameLog:
         return clocks.corrected(ImuData.concatenate(blocks))
 
     def features(self, first: int, stop: int) -> tuple[IntArray, NDArray[np.void]]:
-        """Features of the frames `first` to `stop - 1`, as `TrackRecordingSequence.features`."""
-        return self._recorder.recorded(_Silent()).features(
+        """Features of the frames `first` to `stop - 1`, as `TrackRecordingSequence.features`.
+
+        Those that are left out are not among them.
+        """
+        counts, rows = self._recorder.recorded(_Silent()).features(
             self._frames[first], self._frames[stop - 1]
         )
+        if len(self.left_out) == 0:
+            return counts, rows
+        kept = ~np.isin(rows["id"], self.left_out)
+        image = np.repeat(np.arange(counts.size), counts.ravel())
+        left = np.bincount(image[kept], minlength=counts.size)
+        return left.reshape(counts.shape).astype(counts.dtype), rows[kept]
+
+    def without(self, ids: IntArray) -> FrameLog:
+        """The log without some features (N,), beside those that are left out already."""
+        log = copy(self)
+        log.left_out = np.union1d(self.left_out, ids)
+        return log
 
     def _follows(self, frame_ns: int) -> bool:
         """Whether a frame is later than the others and within the IMU samples."""

@@ -13,7 +13,8 @@ import numpy as np
 from gtsam.symbol_shorthand import B, V, X
 
 from slam_graph.arrays import FloatArray, IntArray
-from slam_graph.geometry import NavState, Trajectory, interpolate
+from slam_graph.backend.world_gauge import with_unknown_gauge
+from slam_graph.geometry import NavState, StateHistory, Trajectory, interpolate
 from slam_graph.kernels.imu_prediction import predict_motion
 from slam_graph.sensors import ImuBuffer
 
@@ -264,3 +265,34 @@ def values_of(states: list[NavState]) -> gtsam.Values:
         values.insert(V(k), np.asarray(state.velocity, dtype=np.float64))
         values.insert(B(k), gtsam.imuBias.ConstantBias(state.accel_bias, state.gyro_bias))
     return values
+
+
+def extended_by(earlier: list[NavState], later: Trajectory) -> Trajectory:
+    """A trajectory with velocities and biases, with states before its first one."""
+    history = StateHistory()
+    for state in earlier:
+        history.append(state)
+    parts = history.trajectory(), later
+    names = ("stamps_ns", "positions", "quaternions", "velocities", "accel_biases", "gyro_biases")
+    return Trajectory(
+        **{name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
+    )
+
+
+def in_unknown_world(history: StateHistory, unknown: FloatArray) -> StateHistory:
+    """States with the uncertainty of the gauge of their world added to their covariances.
+
+    Args:
+        history: whose world turns about its first state.
+        unknown: (4, 4) or (6, 6) covariance of the gauge (m, rad), see `world_gauge.py`.
+    """
+    if len(history) == 0 or not unknown.any():
+        return history
+    path, added = history.trajectory(), history.like()
+    poses, sigmas = history.pose_covariances(), history.sigmas()
+    for k, (pose, own) in enumerate(zip(poses, sigmas, strict=True)):
+        covariance = np.diag(own**2)
+        covariance[: len(pose), : len(pose)] = pose
+        state = replace(state_at(path, k), covariance=covariance)
+        added.append(with_unknown_gauge(state, unknown, path.positions[0]))
+    return added
