@@ -77,6 +77,8 @@ def test_a_folder_is_run_and_only_what_is_left_is_run_again(flights: Path, tmp_p
     assert "1 of 3 recordings could not be run" in first.stderr
     assert len([line for line in first.stderr.splitlines() if re.match(r"[123]/3 ", line)]) == 3
     assert "3 recordings: 2 ok, 1 not_done" in first.stdout
+    assert "aligned in" in first.stdout
+    assert "aligned in yaw and position" not in " ".join(first.stdout.split())
     assert all(len(line) <= 100 for line in first.stdout.splitlines() if "100.0%" in line)
     names = ["damaged", "monday_first", "tuesday_first"]
     with (out / "summary.csv").open(newline="") as file:
@@ -88,6 +90,7 @@ def test_a_folder_is_run_and_only_what_is_left_is_run_again(flights: Path, tmp_p
         assert row["status"] == metrics["status"] == "ok"
         truth = metrics["accuracy"]["yaw"]["ate"]["translation_m"]["rmse"]
         assert float(row["ate_m"]) == truth
+        assert row["alignment"] == metrics["extent"]["unmeasured"] == "yaw"
         ordinary = {"feature_rejected_by_gate", "feature_not_triangulated"}
         assert set(metrics["warnings"]) <= ordinary, "single features that a gate rejects"
         assert row["warnings"] == "0"

@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from slam_graph.datasets.groundtruth import read_groundtruth
 from slam_graph.errors import ConfigError, DataError
 from slam_graph.evaluation.absolute_pose_error import ape
+from slam_graph.evaluation.choices import PAIRINGS, DeltaUnit
 from slam_graph.evaluation.relative_pose_error import rpe
 from slam_graph.evaluation.truth_pairing import associate, nearest, synchronize
 from slam_graph.geometry.trajectory import Trajectory, interpolate, seconds_text
@@ -248,3 +249,72 @@ def test_nothing_is_made_up_inside_a_gap() -> None:
     gappy = Trajectory(stamps, np.zeros((3, 3)), np.tile([0.0, 0.0, 0.0, 1.0], (3, 1)))
     _, valid = interpolate(gappy, np.array([0, 5 * 10**7, 5 * 10**8, 10**9]), max_gap_s=0.2)
     assert valid.tolist() == [True, True, False, True]
+
+
+def test_worlds_are_aligned_apart_and_no_step_leads_from_one_to_another() -> None:
+    truth = random_trajectory(4)
+    parts = [truth[:25], truth[25:26], truth[26:]]
+    moved = [random_similarity(k, "sim3").apply(part) for k, part in enumerate(parts)]
+    estimate = Trajectory(
+        truth.stamps_ns,
+        np.concatenate([part.positions for part in moved]),
+        np.concatenate([part.quaternions for part in moved]),
+    )
+    breaks = [int(truth.stamps_ns[row]) for row in (25, 26)]
+    assert ape(truth, estimate, alignment="sim3").statistics.rmse > 0.1
+    found = ape(truth, estimate, alignment="sim3", breaks_ns=breaks)
+    assert found.statistics.max < 1e-9
+    assert found.poses == len(truth) - 1  # a world of one pose cannot be aligned
+    assert np.isnan(found.alignment.scale)
+    steps = rpe(truth, estimate, alignment="sim3", breaks_ns=breaks)
+    assert len(steps) == 24 + 33
+    assert steps.statistics.max < 1e-9
+    for path, part in zip(found.alignment.undo(truth), (moved[0], moved[2]), strict=True):
+        np.testing.assert_allclose(path, part.positions, atol=1e-9)
+    with pytest.raises(DataError, match="cannot align"):
+        ape(truth[:2], estimate[:2], alignment="se3", breaks_ns=breaks[:1])
+
+
+def test_samples_too_far_apart_are_named_with_what_is_bridged() -> None:
+    truth = random_trajectory(1)
+    with pytest.raises(DataError, match=r"samples are 0\.30 s apart, and at most 0\.2 s"):
+        ape(truth[::6], truth[1::6])
+    later = Trajectory(truth.stamps_ns + 10**12, truth.positions, truth.quaternions)
+    with pytest.raises(DataError, match="check their clocks"):
+        ape(truth, later)
+
+
+def test_limits_of_any_length_bridge_all() -> None:
+    truth = random_trajectory(2)
+    for pairing in PAIRINGS:
+        found = ape(truth[::10], truth, pairing=pairing, limit_s=np.inf)
+        assert len(found) >= 6
+
+
+@pytest.mark.parametrize(
+    ("delta", "unit", "message"),
+    [
+        (2.4, "f", "whole number of frames"),
+        (0.0, "f", "too short"),
+        (np.inf, "f", "finite"),
+        (np.inf, "m", "finite"),
+        (np.nan, "d", "finite"),
+        (1e300, "f", "no step of"),
+        (1e300, "m", "no step of"),
+    ],
+)
+def test_lengths_of_steps_without_a_meaning_are_refused(
+    delta: float, unit: DeltaUnit, message: str
+) -> None:
+    path = random_trajectory(3)
+    for all_pairs in (False, True):
+        with pytest.raises(DataError, match=message):
+            rpe(path, path, delta=delta, unit=unit, all_pairs=all_pairs)
+
+
+@pytest.mark.parametrize("unit", ["f", "m", "d", "r"])
+def test_one_pose_has_no_step(unit: DeltaUnit) -> None:
+    path = random_trajectory(3)
+    for all_pairs in (False, True):
+        with pytest.raises(DataError, match="no step of"):
+            rpe(path, path[:1], unit=unit, all_pairs=all_pairs)

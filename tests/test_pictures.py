@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Pictures: one colour for one name, σ in the axes of the world, and something for every input."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -17,6 +18,7 @@ from slam_graph.results.run_picture import (
     IN_MAP,
     LOOPS_CLOSED,
     PoseEstimate,
+    _title,
     with_path_in_map,
 )
 from slam_graph.visualization.bundle_picture import bundle_figure
@@ -116,6 +118,33 @@ def test_a_path_in_a_map_is_aligned_by_itself() -> None:
     error = sg.ape(result.groundtruth, path).statistics.rmse
     aligned = sg.ape(result.groundtruth, result.trajectory, alignment="yaw").statistics.rmse
     assert error == pytest.approx(aligned, rel=1e-6)
+
+
+@pytest.mark.parametrize("mode", ["yaw", "se3"])
+def test_a_path_in_a_map_is_aligned_in_what_nothing_measured_there(mode: str) -> None:
+    result = sg.run(sg.simulate(trajectory="figure8", duration_s=4.0, rate_hz=10.0))
+    tilted = Similarity(Rotation.from_euler("xz", [0.8, 0.7]).as_matrix(), np.ones(3))
+    path = tilted.apply(result.trajectory)
+    view = with_path_in_map(result._view(), path, {"alignment": mode})
+    assert view.truth is not None
+    error = sg.ape(view.truth, view.paths[IN_MAP]).statistics.rmse
+    assert (error < 0.05) == (mode == "se3")
+
+
+def test_a_truth_of_another_time_is_a_warning_with_both_spans(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    flight = sg.simulate(duration_s=1.5, rate_hz=10.0)
+    truth = flight.groundtruth()
+    assert truth is not None
+    later = replace(truth, stamps_ns=truth.stamps_ns + 100_000_000_000)
+    monkeypatch.setattr(flight, "groundtruth", lambda: later)
+    result = sg.run(flight, overrides=["final_ba.enabled=false"])
+    assert result.warnings["groundtruth_elsewhere"] == 1
+    said = [line for line in caplog.messages if "groundtruth_elsewhere" in line]
+    for stamp_ns in (*later.stamps_ns[[0, -1]], *result.input.states_ns):
+        assert f"{stamp_ns * 1e-9:.3f}" in said[0]
+    assert "the ground truth shares no time with the run" in _title(result.metrics)
 
 
 def test_a_picture_for_a_notebook_has_a_palette_and_looks_the_same() -> None:

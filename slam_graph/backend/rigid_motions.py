@@ -133,7 +133,7 @@ class RigidMotions:
     @property
     def static(self) -> IntArray:
         """Ids of the tracks that clearly stand still, ascending."""
-        return self.ids[self.clear & (self.body == 0)]
+        return np.asarray(self.ids[self.clear & (self.body == 0)])
 
 
 def rays_of(
@@ -293,7 +293,7 @@ def _another(
         pose = pairs.fitted(near, chosen, _SCALES)
         pose = pairs.fitted(pose, apart, _SCALES[_NEARBY:])
         distances = pairs.distances(pose)
-        count = np.count_nonzero((distances < _FITS) & (distances < best - _GAIN))
+        count = int(np.count_nonzero((distances < _FITS) & (distances < best - _GAIN)))
         if count >= most:
             found, most = pose, count + 1
         if count >= 0.7 * len(rows):

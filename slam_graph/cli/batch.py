@@ -46,7 +46,7 @@ if TYPE_CHECKING:
 _Row = dict[str, Any]
 
 _EXPLANATION = (
-    "ATE, rot.: root mean square errors of the causal estimate, aligned in yaw and position; "
+    "ATE, rot.: root mean square errors of the causal estimate, aligned in what nothing measured; "
     "smoothed: ATE after the final bundle adjustment. Speed: times real time."
 )
 _MOST_REASONS = 10
@@ -187,6 +187,7 @@ def _echo(rows: list[_Row]) -> None:
         "recording",
         "status",
         "coverage",
+        "aligned in",
         "ATE [m]",
         "rot. [°]",
         "smoothed",
@@ -215,6 +216,7 @@ def _cells(row: _Row) -> tuple[str, ...]:
         row["name"],
         row["status"],
         "-" if coverage is None else f"{coverage:.1%}",
+        row["alignment"] or "-",
         number(row["ate_m"]),
         number(row["rotation_deg"], 2),
         number(row["smoothed_ate_m"]),

@@ -19,6 +19,7 @@ from slam_graph.cli.console import (
     echo_table,
     number,
 )
+from slam_graph.cli.error_tables import accuracy_rows, segment_rows
 from slam_graph.cli.loading import loading
 from slam_graph.cli.options import (
     INTERRUPTED,
@@ -71,17 +72,20 @@ def echo_summary(result: RunResult, folder: Path, files: list[Path]) -> None:
     echo_table(_overview(metrics))
     if metrics["accuracy"]:
         typer.echo("")
-        echo_table(_accuracy(metrics["accuracy"]))
+        echo_table(accuracy_rows(metrics["accuracy"]))
     if metrics["final_ba"] and metrics["final_ba"]["accuracy"]:
         typer.echo("")
-        echo_table(_accuracy(metrics["final_ba"]["accuracy"], "smoothed"))
+        echo_table(accuracy_rows(metrics["final_ba"]["accuracy"], "smoothed"))
+    if metrics["segments"]:
+        typer.echo("")
+        echo_table(segment_rows(metrics))
     loops = metrics["loop_closure"]
     if loops and loops["accepted"] and loops["accuracy"]:
         typer.echo("")
-        echo_table(_accuracy(loops["accuracy"], "loops closed"))
+        echo_table(accuracy_rows(loops["accuracy"], "loops closed"))
     if metrics["localization"] and metrics["localization"]["accuracy"]:
         typer.echo("")
-        echo_table(_accuracy(metrics["localization"]["accuracy"], "in the map"))
+        echo_table(accuracy_rows(metrics["localization"]["accuracy"], "in the map"))
     if metrics["nees"] and "unavailable" not in metrics["nees"]:
         typer.echo("")
         echo_table(_consistency(metrics["nees"]))
@@ -116,6 +120,9 @@ def _overview(metrics: _Table) -> Iterator[tuple[str, str]]:
         )
     if extent["scale"] == "unknown":
         yield "scale", "unknown: lengths are up to scale"
+    if extent["world_breaks_ns"]:
+        worlds = len(extent["world_breaks_ns"]) + 1
+        yield "worlds", f"{worlds}, of which nothing joins one with another; errors are of each"
     if timing["frames_per_s"] is not None:
         yield (
             "speed",
@@ -193,24 +200,6 @@ def _located(table: _Table) -> str:
         f"matches accepted in {table['queries']} comparisons, "
         f"{table['ms_per_frame']:.1f} ms a frame"
     )
-
-
-def _accuracy(accuracy: _Table, title: str = "alignment") -> Iterator[tuple[str, ...]]:
-    """Absolute and relative errors under each alignment."""
-    yield title, "ATE rmse [m]", "[deg]", "RPE rmse, 1 m [m]", "[deg]", "scale"
-    for mode, table in accuracy.items():
-        if "unavailable" in table:
-            yield mode, table["unavailable"]
-            continue
-        steps = table["rpe"]
-        yield (
-            mode,
-            number(table["ate"]["translation_m"]["rmse"]),
-            number(table["ate"]["rotation_deg"]["rmse"], 3),
-            number(steps["translation_m"]["rmse"] if "delta_m" in steps else None),
-            number(steps["rotation_deg"]["rmse"] if "delta_m" in steps else None, 3),
-            number(table["scale"]),
-        )
 
 
 def _consistency(nees: _Table, title: str = "NEES") -> Iterator[tuple[str, ...]]:

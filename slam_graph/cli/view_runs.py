@@ -114,9 +114,11 @@ def _compared(
     estimate, camera = run.trajectory, run.scaled_camera
     if camera is not None:  # its path is scaled, and not that of the body
         reference, estimate = reference.mounted(camera), estimate.mounted(camera)
-    position = ape(reference, estimate, "trans_part", run.unmeasured)
-    rotation = ape(reference, estimate, "angle_deg", run.unmeasured)
-    moved = position.similarity.apply(estimate)
+    breaks = run.metrics["extent"].get("world_breaks_ns", [])
+    mode = run.unmeasured
+    position = ape(reference, estimate, "trans_part", mode, breaks_ns=breaks)
+    rotation = ape(reference, estimate, "angle_deg", mode, breaks_ns=breaks)
+    moved = position.alignment.apply(estimate)
     return {
         "path": moved.positions,
         "time_s": np.asarray((position.stamps_ns - start_ns) * 1e-9, np.float64),

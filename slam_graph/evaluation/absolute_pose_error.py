@@ -18,6 +18,7 @@ the numbers are evo's.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, get_args
 
@@ -25,10 +26,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from slam_graph.arrays import FloatArray
+from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.display import Displayed
 from slam_graph.evaluation.choices import ERROR_UNITS, Pairing, PoseRelation, require_known
 from slam_graph.evaluation.truth_pairing import synchronize
+from slam_graph.evaluation.worlds_apart import WorldAlignment
 from slam_graph.geometry import AlignmentMode, Similarity, Trajectory
 
 
@@ -77,7 +79,7 @@ class ErrorSeries(Displayed):
         stamps_ns: (N,) times of the estimate; of the end of the pair for a relative error.
         values: (N,) errors.
         statistics: their summary.
-        similarity: the map that was applied to the estimate.
+        alignment: the maps that were applied to the estimate, of each of its worlds.
         poses: number of poses that both trajectories share.
         unit: of the errors; empty where they have none.
         step_unit: of the length of a step of a relative error.
@@ -86,13 +88,18 @@ class ErrorSeries(Displayed):
     stamps_ns: NDArray[np.int64]
     values: NDArray[np.float64]
     statistics: Statistics
-    similarity: Similarity
+    alignment: WorldAlignment
     poses: int
     unit: str = ""
     step_unit: str = ""
 
     def __len__(self) -> int:
         return len(self.values)
+
+    @property
+    def similarity(self) -> Similarity:
+        """The map that was applied to the estimate, or to its first world."""
+        return self.alignment.first
 
     def __repr__(self) -> str:
         parts = ", ".join(
@@ -104,7 +111,7 @@ class ErrorSeries(Displayed):
         """Unit, scale of the alignment, numbers of poses and errors, and statistics."""
         return {
             "unit": self.unit,
-            "scale": self.similarity.scale,
+            "scale": self.alignment.scale,
             "poses": self.poses,
             "errors": len(self.values),
             "statistics": asdict(self.statistics),
@@ -136,6 +143,7 @@ def ape(
     alignment: AlignmentMode = "none",
     pairing: Pairing = "interpolate",
     limit_s: float | None = None,
+    breaks_ns: Sequence[int] | IntArray = (),
 ) -> ErrorSeries:
     """Absolute pose error of an estimate.
 
@@ -147,13 +155,15 @@ def ape(
         pairing: whether the truth is interpolated at the times of the estimate, or the pose
             nearest in time is taken.
         limit_s: the longest gap or difference in time that is bridged; None: as `synchronize` says.
+        breaks_ns: increasing times at which the estimate goes on in another world. Each world is
+            aligned by itself then, and left out if it cannot be.
 
     Raises:
         ConfigError: if there is no such relation, alignment or pairing.
         DataError: if the trajectories share no time, or cannot be aligned.
     """
     require_known(relation, ERROR_UNITS, "relation")
-    truth, guess, similarity = aligned_pair(reference, estimate, alignment, pairing, limit_s)
+    truth, guess, worlds = aligned_pair(reference, estimate, alignment, pairing, limit_s, breaks_ns)
     difference = relative_poses(
         Rotation.from_quat(truth.quaternions),
         truth.positions,
@@ -162,7 +172,7 @@ def ape(
     )
     values = errors(*difference, relation)
     statistics, unit = Statistics.of(values), ERROR_UNITS[relation]
-    return ErrorSeries(guess.stamps_ns, values, statistics, similarity, len(truth), unit)
+    return ErrorSeries(guess.stamps_ns, values, statistics, worlds, len(truth), unit)
 
 
 def aligned_pair(
@@ -171,8 +181,9 @@ def aligned_pair(
     alignment: AlignmentMode,
     pairing: Pairing,
     limit_s: float | None,
-) -> tuple[Trajectory, Trajectory, Similarity]:
-    """The truth and the estimate pose by pose, the estimate aligned, and the map that did so.
+    breaks_ns: Sequence[int] | IntArray = (),
+) -> tuple[Trajectory, Trajectory, WorldAlignment]:
+    """The truth and the estimate pose by pose, the estimate aligned, and the maps that did so.
 
     Raises:
         ConfigError: if there is no such alignment or pairing.
@@ -180,8 +191,8 @@ def aligned_pair(
     """
     require_known(alignment, get_args(AlignmentMode), "alignment")
     truth, guess = synchronize(reference, estimate, pairing, limit_s)
-    similarity = Similarity.of_positions(truth.positions, guess.positions, alignment)
-    return truth, similarity.apply(guess), similarity
+    worlds = WorldAlignment.fitted(truth, guess, alignment, breaks_ns)
+    return truth.select(worlds.known(guess.stamps_ns)), worlds.apply(guess), worlds
 
 
 def relative_poses(

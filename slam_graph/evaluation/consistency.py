@@ -15,7 +15,9 @@ Bar-Shalom, Li & Kirubarajan, "Estimation with Applications to Tracking and Navi
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import gtsam
 import numpy as np
@@ -49,6 +51,24 @@ class Nees:
     pose: FloatArray
     covariances: FloatArray
     similarity: Similarity
+
+    @staticmethod
+    def joined(parts: Sequence[Nees]) -> Nees:
+        """That of W ≥ 1 worlds, in the order of time, with the map of the first."""
+        if len(parts) == 1:
+            return parts[0]
+
+        def column(name: str) -> NDArray[Any]:
+            return np.concatenate([getattr(part, name) for part in parts])
+
+        return Nees(
+            column("stamps_ns"),
+            orientation=column("orientation"),
+            position=column("position"),
+            pose=column("pose"),
+            covariances=column("covariances"),
+            similarity=parts[0].similarity,
+        )
 
     def series(self) -> dict[str, tuple[FloatArray, int]]:
         """Each series by its name, with its degrees of freedom."""

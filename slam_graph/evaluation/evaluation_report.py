@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, replace
 from functools import partial
@@ -14,6 +14,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from slam_graph.arrays import FloatArray
 from slam_graph.errors import DataError
 from slam_graph.evaluation.absolute_pose_error import ErrorSeries, ape
 from slam_graph.evaluation.alignment_covariance import aligned_by_smoothed
@@ -36,13 +37,21 @@ _REPORTED_ALIGNMENTS: tuple[AlignmentMode, ...] = ("none", "yaw", "se3", "sim3")
 _RPE_DELTA_M = 1.0
 """Relative errors are taken over all pairs of poses about one metre of path apart."""
 
+_UNPLACED_M = 100.0
+"""σ of a position beyond which nothing is known of it."""
+
 _NO_SCALE = "the scale is unknown: see sim3"
 
 Table = dict[str, Any]
 
+_NeesAlignment = AlignmentMode | Literal["first_pose", "first_pose_and_scale"]
+
 
 def accuracy_report(
-    reference: Trajectory, estimate: Trajectory, scaled_camera: gtsam.Pose3 | None = None
+    reference: Trajectory,
+    estimate: Trajectory,
+    scaled_camera: gtsam.Pose3 | None = None,
+    breaks_ns: Sequence[int] = (),
 ) -> Table:
     """Absolute and relative errors, translation (m) and rotation (deg), under each alignment.
 
@@ -51,6 +60,8 @@ def accuracy_report(
         estimate: the other one.
         scaled_camera: body_T_camera, where lengths of the estimate are known up to a scale. Errors
             are then those of the camera's path, and only after an alignment in scale.
+        breaks_ns: increasing times at which the estimate goes on in another world; each world is
+            aligned by itself, and a scale that is not common to all is NaN.
 
     Returns:
         For each alignment `{"scale", "poses", "ate": {"translation_m", "rotation_deg"}, "rpe":
@@ -60,7 +71,7 @@ def accuracy_report(
     if scaled_camera is not None:
         reference, estimate = (path.mounted(scaled_camera) for path in (reference, estimate))
     return {
-        mode: _or_reason(partial(_errors_under, reference, estimate, mode))
+        mode: _or_reason(partial(_errors_under, reference, estimate, mode, breaks_ns))
         if scaled_camera is None or mode == "sim3"
         else {"unavailable": _NO_SCALE}
         for mode in _REPORTED_ALIGNMENTS
@@ -72,6 +83,7 @@ def consistency_report(
     history: StateHistory,
     aligned: bool,
     smoothed: FinalBa | None = None,
+    breaks_ns: Sequence[int] = (),
 ) -> Table | None:
     """NEES of orientation, position and pose, or None without covariances.
 
@@ -81,8 +93,9 @@ def consistency_report(
         aligned: whether the estimate already lives in the world of the truth (the start was
             given); otherwise it is aligned as `nees_of_run` says.
         smoothed: see `nees_of_run`.
+        breaks_ns: see `nees_of_run`.
     """
-    result, alignment = nees_of_run(truth, history, aligned, smoothed)
+    result, alignment = nees_of_run(truth, history, aligned, smoothed, breaks_ns)
     if len(result.stamps_ns) == 0:
         return None
     table: Table = {"alignment": alignment, "states": len(result.pose)}
@@ -142,7 +155,8 @@ def nees_of_run(
     history: StateHistory,
     aligned: bool,
     smoothed: FinalBa | None = None,
-) -> tuple[Nees, AlignmentMode | Literal["first_pose", "first_pose_and_scale"]]:
+    breaks_ns: Sequence[int] = (),
+) -> tuple[Nees, _NeesAlignment]:
     """NEES of the states of a run, and the alignment under which it was taken.
 
     An estimate that does not live in the world of the truth is aligned in yaw and position, which
@@ -161,6 +175,9 @@ def nees_of_run(
         history: estimated states, or those of the smoothed trajectory.
         aligned: whether the estimate lives in the world of the truth already.
         smoothed: the smoothed trajectory of the run, if there is one.
+        breaks_ns: increasing times at which the estimate goes on in another world. Each world is
+            aligned by its first pose then, to which its covariances are relative. A causal world
+            whose place is not known has none, and is left out.
 
     Raises:
         DataError: if truth and estimate share no time.
@@ -169,34 +186,69 @@ def nees_of_run(
     if history.scaled_camera is not None:
         covariances = mounted_covariances(covariances, history.scaled_camera)
         truth, estimate = (path.mounted(history.scaled_camera) for path in (truth, estimate))
-    if aligned:
+    if aligned and not len(breaks_ns):
         return nees(estimate, covariances, truth), "none"
+    if smoothed is not None and not len(breaks_ns):
+        synchronize(truth, estimate)
+        with suppress(DataError):  # what never moves determines no yaw
+            found = aligned_by_smoothed(truth, history, smoothed)
+            if found is not None:
+                return nees(estimate, found[1], truth, found[0]), "yaw"
+    parts, failures = [], []
+    world = np.searchsorted(breaks_ns, estimate.stamps_ns, "right")
+    for number in range(len(breaks_ns) + 1):
+        rows = np.flatnonzero(world == number)
+        part, known = estimate.select(rows), covariances[rows]
+        if number and len(rows) and _is_unplaced(known[0]):
+            continue
+        try:
+            given = aligned and number == 0
+            onto = None if given else _by_first_pose(truth, part, known, history)
+            parts.append(nees(part, known, truth, onto))
+        except DataError as error:
+            failures.append(error)
+    if not parts:
+        raise failures[0]
+    return Nees.joined(parts), "first_pose" if history.has_scale else "first_pose_and_scale"
+
+
+def _is_unplaced(covariance: FloatArray) -> bool:
+    """Whether a covariance (6, 6) of the first pose of a world says that its place is not known.
+
+    Then those of later ones say the same, and nothing of what has been estimated since.
+    """
+    return bool(np.trace(covariance[3:, 3:]) > _UNPLACED_M**2)
+
+
+def _by_first_pose(
+    truth: Trajectory, estimate: Trajectory, covariances: FloatArray, history: StateHistory
+) -> Similarity:
+    """The alignment of N states, with covariances (N, 6, 6), to whose first these are relative.
+
+    Raises:
+        DataError: if truth and estimate share no time.
+    """
     true, own = synchronize(truth, estimate)
-    with suppress(DataError):  # what never moves determines no yaw
-        found = None if smoothed is None else aligned_by_smoothed(truth, history, smoothed)
-        if found is not None:
-            return nees(estimate, found[1], truth, found[0]), "yaw"
-    if not history.has_scale:
-        scale = scale_of_covariances(truth, estimate, covariances)
-        if scale is None:
-            scale = Similarity.of_positions(true.positions, own.positions, "sim3").scale
-        scaled = Similarity(np.eye(3), np.zeros(3), scale)
-        first = Similarity.of_first_pose(true, scaled.apply(own), level=False)
-        return nees(
-            estimate, covariances, truth, replace(first, scale=scale)
-        ), "first_pose_and_scale"
-    first = Similarity.of_first_pose(true, own, history.level)
-    return nees(estimate, covariances, truth, first), "first_pose"
+    if history.has_scale:
+        return Similarity.of_first_pose(true, own, history.level)
+    scale = scale_of_covariances(truth, estimate, covariances)
+    if scale is None:
+        scale = Similarity.of_positions(true.positions, own.positions, "sim3").scale
+    scaled = Similarity(np.eye(3), np.zeros(3), scale)
+    first = Similarity.of_first_pose(true, scaled.apply(own), level=False)
+    return replace(first, scale=scale)
 
 
-def _errors_under(reference: Trajectory, estimate: Trajectory, mode: AlignmentMode) -> Table:
+def _errors_under(
+    reference: Trajectory, estimate: Trajectory, mode: AlignmentMode, breaks_ns: Sequence[int]
+) -> Table:
     """The errors under one alignment, against the truth interpolated at the estimate's times."""
-    options: Table = {"alignment": mode}
+    options: Table = {"alignment": mode, "breaks_ns": breaks_ns}
     steps: Table = {**options, "delta": _RPE_DELTA_M, "unit": "m", "all_pairs": True}
     translation = ape(reference, estimate, "trans_part", **options)
     return {
         "poses": translation.poses,
-        "scale": translation.similarity.scale,
+        "scale": translation.alignment.scale,
         "ate": {
             "translation_m": _statistics(translation),
             "rotation_deg": _statistics(ape(reference, estimate, "angle_deg", **options)),

@@ -8,6 +8,8 @@ the numbers are evo's.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -45,6 +47,7 @@ def rpe(
     pairs_from_reference: bool = False,
     pairing: Pairing = "interpolate",
     limit_s: float | None = None,
+    breaks_ns: Sequence[int] | IntArray = (),
 ) -> ErrorSeries:
     """Relative pose error of an estimate.
 
@@ -61,17 +64,25 @@ def rpe(
         pairing: whether the truth is interpolated at the times of the estimate, or the pose
             nearest in time is taken.
         limit_s: the longest gap or difference in time that is bridged; None: as `synchronize` says.
+        breaks_ns: as for `ape`; no step is from one world to another.
 
     Raises:
         ConfigError: if there is no such relation, alignment, unit or pairing.
-        DataError: if the trajectories share no time, cannot be aligned, or have no such step.
+        DataError: if the trajectories share no time, cannot be aligned, or have no such step, or
+            the length of a step is not finite, or no whole number of frames.
     """
     require_known(relation, ERROR_UNITS, "relation")
     require_known(unit, STEP_UNITS, "unit of a step")
-    truth, aligned, similarity = aligned_pair(reference, estimate, alignment, pairing, limit_s)
+    _require_length(delta, unit)
+    truth, aligned, worlds = aligned_pair(
+        reference, estimate, alignment, pairing, limit_s, breaks_ns
+    )
     start, end = _step_pairs(
         truth if pairs_from_reference else aligned, delta, unit, all_pairs, tolerance
     )
+    world = worlds.world_of(aligned.stamps_ns)
+    inside = world[start] == world[end]
+    start, end = start[inside], end[inside]
     if len(start) == 0:
         raise DataError(
             f"no step of {delta:g} {STEP_UNITS[unit]} in {len(truth)} shared poses; "
@@ -83,11 +94,29 @@ def rpe(
         aligned.stamps_ns[end],
         values,
         Statistics.of(values),
-        similarity,
+        worlds,
         len(truth),
         ERROR_UNITS[relation],
         STEP_UNITS[unit],
     )
+
+
+def _require_length(delta: float, unit: DeltaUnit) -> None:
+    """Refuse a length of steps that has no meaning.
+
+    Raises:
+        DataError: saying why.
+    """
+    if not np.isfinite(delta):
+        raise DataError(f"a step of {delta:g} {STEP_UNITS[unit]}; choose a finite --delta")
+    if unit != "f":
+        return
+    if delta != round(delta):
+        raise DataError(
+            f"a step is a whole number of frames, not {delta:g}; choose another --delta"
+        )
+    if delta < 1:
+        raise DataError(f"a step of {delta:g} frames is too short; choose --delta of at least 1")
 
 
 def _step_pairs(
@@ -116,10 +145,8 @@ def _motions(trajectory: Trajectory, start: IntArray, end: IntArray) -> tuple[Ro
 
 
 def _frame_pairs(count: int, delta: float, all_pairs: bool) -> tuple[IntArray, IntArray]:
-    """Pairs of poses `delta` rows apart."""
-    step = round(delta)
-    if step < 1:
-        raise DataError(f"a step of {delta:g} frames is too short; choose --delta of at least 1")
+    """Pairs of poses `delta` rows apart, a whole number."""
+    step = round(min(delta, count))
     start = np.arange(0, count - step, 1 if all_pairs else step, dtype=np.int64)
     return start, start + step
 
@@ -161,7 +188,7 @@ def _pairs_at_angle(
     rotations: Rotation, delta: float, tolerance: float
 ) -> tuple[IntArray, IntArray]:
     """All pairs whose relative rotation has an angle within the tolerance of `delta` (radians)."""
-    starts, ends = [], []
+    starts, ends = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)]
     for first in range(len(rotations) - 1):
         angles = (rotations[first].inv() * rotations[first + 1 :]).magnitude()
         last = first + 1 + np.flatnonzero(np.abs(angles - delta) <= tolerance * delta)

@@ -25,7 +25,7 @@ _DEFAULT_LIMITS_S: dict[Pairing, float] = {"interpolate": Trajectory.MAX_GAP_S, 
 nearest one may be."""
 
 _WAYS_OUT: dict[Pairing, str] = {
-    "interpolate": "check their clocks, or take the nearest poses with --t_max_diff",
+    "interpolate": "check their clocks",
     "nearest": "check their clocks or raise --t_max_diff",
 }
 
@@ -58,7 +58,7 @@ def associate(
     few_is_reference = len(estimate_ns) > len(reference_ns)
     few, many = (reference_ns, estimate_ns) if few_is_reference else (estimate_ns, reference_ns)
     partner = nearest(many, few)
-    kept = np.flatnonzero(np.abs(many[partner] - few) <= round(max_difference_s * 1e9))
+    kept = np.flatnonzero(np.abs(many[partner] - few) <= np.rint(max_difference_s * 1e9))
     pairs = (kept.astype(np.int64), partner[kept])
     return pairs if few_is_reference else (pairs[1], pairs[0])
 
@@ -115,11 +115,25 @@ def synchronize(
     """
     true, rows = paired(reference, estimate, pairing, limit_s)
     if len(rows) == 0:
-        raise DataError(
-            f"no pose of the estimate ({_span(estimate)}) has a true pose at its time in the "
-            f"reference ({_span(reference)}); {_WAYS_OUT[pairing]}"
-        )
+        found = f"no pose of the estimate ({_span(estimate)}) has a true pose at its time in the "
+        found += f"reference ({_span(reference)})"
+        bridged_s = _DEFAULT_LIMITS_S[pairing] if limit_s is None else limit_s
+        gap_s = _gap_s(reference, estimate)
+        if pairing == "interpolate" and gap_s is not None and gap_s > bridged_s:
+            raise DataError(
+                f"{found}: its samples are {gap_s:.2f} s apart, and at most {bridged_s:g} s are "
+                "bridged; `slam-graph ape` takes the nearest poses with --t_max_diff"
+            )
+        raise DataError(f"{found}; {_WAYS_OUT[pairing]}")
     return true, estimate.select(rows)
+
+
+def _gap_s(reference: Trajectory, estimate: Trajectory) -> float | None:
+    """The median gap between the samples of the truth around poses; None if none is inside."""
+    times = reference.stamps_ns
+    after = np.searchsorted(times, estimate.stamps_ns)
+    inside = after[(after > 0) & (after < len(times))]
+    return float(np.median(times[inside] - times[inside - 1])) * 1e-9 if len(inside) else None
 
 
 def _span(trajectory: Trajectory) -> str:

@@ -19,7 +19,7 @@ Row = dict[str, Any]
 _COLUMNS = (
     *("name", "status", "message", "algorithm", "cameras", "format", "content"),
     *("recorded_s", "frames", "initialization_s", "coverage"),
-    *("ate_m", "rotation_deg", "smoothed_ate_m", "smoothed_rotation_deg"),
+    *("alignment", "ate_m", "rotation_deg", "smoothed_ate_m", "smoothed_rotation_deg"),
     *("frames_per_s", "real_time_factor", "final_ba_s", "peak_memory_mb"),
     *("warnings", "warning_kinds", "data", "folder"),
 )
@@ -90,6 +90,7 @@ def _measured(metrics: Mapping[str, Any]) -> Row:
         "frames": extent["frames"],
         "initialization_s": extent["initialization_s"],
         "coverage": extent["coverage"],
+        "alignment": mode if causal[0] is not None or smoothed[0] is not None else None,
         "ate_m": causal[0],
         "rotation_deg": causal[1],
         "smoothed_ate_m": smoothed[0],

@@ -29,7 +29,7 @@ from slam_graph.results import ResultFolder
 from slam_graph.settings import Settings
 from slam_graph.version import __version__
 
-SCHEMA_VERSION = 2
+SCHEMA_VERSION = 3
 MARK = "batch.json"
 """The file that says which settings a folder of results is of; it is written last."""
 

@@ -10,7 +10,8 @@ covariance, or all F frames:
   the world of the run;
 - `translation_m`, `rotation_deg` (N,): errors after that alignment;
 - `time_s`, `distance_m` (N,): since the first frame; along the true path;
-- `translation_m_MODE`, `rotation_deg_MODE` (N,): errors, for each alignment;
+- `translation_m_MODE`, `rotation_deg_MODE` (N,): errors, for each alignment; of a run in several
+  worlds each is aligned by itself, and errors are NaN in those that the alignment lacks;
 - `nees_time_s`, `nees_orientation`, `nees_position`, `nees_pose` (K,);
 - `step_time_s`, `steps`, `columns`, `cost_before`, `cost_after` (G,): for the G frames with
   Gauss-Newton steps, their number, the dimension of the state and the cost;
@@ -24,6 +25,7 @@ from __future__ import annotations
 import json
 import zlib
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 from zipfile import BadZipFile, ZipFile
@@ -37,7 +39,7 @@ from slam_graph.files import Files
 from slam_graph.geometry import AlignmentMode, Trajectory
 from slam_graph.results import ResultFolder, RunResult, SavedRun
 
-SCHEMA_VERSION = 4
+SCHEMA_VERSION = 5
 
 ALIGNMENTS: tuple[AlignmentMode, ...] = ("none", "yaw", "se3", "sim3")
 
@@ -181,6 +183,11 @@ def _error_series(truth: Trajectory, result: RunResult) -> Series:
     camera = result.history.scaled_camera
     if camera is not None:
         true, estimate = (path.mounted(camera) for path in (true, estimate))
+    free, breaks = result.history.free, result.segments.breaks_ns()
+    with suppress(DataError):  # without motion the alignment is undetermined
+        known = ape(true, estimate, alignment=free, breaks_ns=breaks).alignment.known
+        rows = np.flatnonzero(known(estimate.stamps_ns))
+        true, estimate = true.select(rows), estimate.select(rows)
     steps = np.linalg.norm(np.diff(true.positions, axis=0), axis=1)
     series: Series = {
         "time_s": (estimate.stamps_ns - result.input.states_ns[0]) * 1e-9,
@@ -189,21 +196,25 @@ def _error_series(truth: Trajectory, result: RunResult) -> Series:
     }
     for mode in ALIGNMENTS if result.history.has_scale else ("sim3",):
         try:
-            translation = ape(true, estimate, "trans_part", mode)
+            translation = ape(true, estimate, "trans_part", mode, breaks_ns=breaks)
         except DataError:
             continue  # without motion the alignment is undetermined
-        series[f"translation_m_{mode}"] = translation.values
-        series[f"rotation_deg_{mode}"] = ape(true, estimate, "angle_deg", mode).values
-        if mode == result.history.free:
+        rotation = ape(true, estimate, "angle_deg", mode, breaks_ns=breaks)
+        rows = np.flatnonzero(translation.alignment.known(estimate.stamps_ns))
+        for name, found in (("translation_m", translation), ("rotation_deg", rotation)):
+            series[f"{name}_{mode}"] = np.full(len(estimate), np.nan)
+            series[f"{name}_{mode}"][rows] = found.values
+        if mode == free:
             series["translation_m"] = series[f"translation_m_{mode}"]
             series["rotation_deg"] = series[f"rotation_deg_{mode}"]
-            series["path"] = translation.similarity.apply(estimate).positions
+            series["path"] = translation.alignment.apply(estimate).positions
     return series
 
 
 def _nees_series(truth: Trajectory, result: RunResult) -> Series:
     try:
-        values, _ = nees_of_run(truth, result.history, result.start_was_given, result.final_ba)
+        given, breaks = result.start_was_given, result.segments.breaks_ns()
+        values, _ = nees_of_run(truth, result.history, given, result.final_ba, breaks)
     except DataError:
         return {}
     return {

@@ -60,8 +60,9 @@ def _paths(run: SavedRun) -> list[tuple[str, FloatArray]]:
             continue
         if truth is not None:
             try:
-                found = ape(truth, estimate, "trans_part", run.unmeasured)
-                estimate = found.similarity.apply(estimate)
+                breaks = run.metrics["extent"].get("world_breaks_ns", [])
+                found = ape(truth, estimate, alignment=run.unmeasured, breaks_ns=breaks)
+                estimate = found.alignment.apply(estimate)
             except DataError:  # no common time: the two cannot be shown in one world
                 drawn = [path for path in drawn if path[0] != TRUE]
         drawn.append((color, _thinned(estimate)))

@@ -326,7 +326,7 @@ def interpolate(
     after = np.clip(np.searchsorted(times, stamps_ns), 0, len(times) - 1)
     before = np.where(times[after] == stamps_ns, after, np.maximum(after - 1, 0))
     inside = (times[before] <= stamps_ns) & (stamps_ns <= times[after])
-    valid = inside & (times[after] - times[before] <= round(max_gap_s * 1e9))
+    valid = inside & (times[after] - times[before] <= np.rint(max_gap_s * 1e9))
     before, after, queries = before[valid], after[valid], stamps_ns[valid]
     length = np.maximum(times[after] - times[before], 1)
     weight = ((queries - times[before]) / length)[:, None]

@@ -98,6 +98,8 @@ def run(
     result = RunResult(_part_of(sequence, settings))
     rig = result.input.rig
     result.history.level, result.history.scaled_camera = rig.has_imu, rig.scaled_camera
+    if result.input.truth is not None and result.groundtruth is None:
+        sequence.diagnostics.warn("groundtruth_elsewhere", _truth_elsewhere(result.input))
     if not rig.has_scale:
         sequence.diagnostics.warn("scale_unknown", _NO_SCALE)
         if isinstance(sequence, RecordedSequence) and len(sequence.aiding.odometry_stamps_ns):
@@ -136,6 +138,20 @@ def run(
         finish(stages, result, interrupts)
     result.warnings = +sequence.diagnostics.counts
     return result
+
+
+def _truth_elsewhere(asked: RunInput) -> str:
+    """That the ground truth shares no time with what is run, and the spans of both."""
+    assert asked.truth is not None
+    truth_ns = asked.truth.stamps_ns.tolist()
+    true, run = (
+        f"from {ends[0] * 1e-9:.3f} to {ends[-1] * 1e-9:.3f} s" if ends else "empty"
+        for ends in (truth_ns, asked.states_ns)
+    )
+    return (
+        f"the ground truth is {true}, the run {run}: they share no time, so that there are no "
+        "errors; check their clocks"
+    )
 
 
 def _place_stages(sequence: Sequence, result: RunResult, known_map: SlamMap | None) -> list[Stage]:

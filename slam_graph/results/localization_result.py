@@ -15,7 +15,7 @@ import numpy as np
 from slam_graph import evaluation
 from slam_graph.arrays import BoolArray, FloatArray, IntArray
 from slam_graph.errors import DataError
-from slam_graph.geometry import Similarity, Trajectory
+from slam_graph.geometry import AlignmentMode, Similarity, Trajectory
 
 if TYPE_CHECKING:
     from slam_graph.maps import SlamMap
@@ -124,6 +124,7 @@ class LocalizationLog:
             "first_s": float(stamps_ns[0] - start_ns) * 1e-9 if len(stamps_ns) else None,
             **self.counts,
             "ms_per_frame": 1e3 * self.seconds / max(frames, 1),
+            "alignment": _unmeasured(self.known),
             "accuracy": self._accuracy(truth),
         }
 
@@ -158,7 +159,12 @@ def map_alignment(truth: Trajectory, known: SlamMap) -> Similarity:
     if sum(len(true) for true, _ in pairs) < _LEAST_SHARED:
         raise DataError(f"the truth covers fewer than {_LEAST_SHARED} keyframes of the map")
     true, own = (np.concatenate([pair[side].positions for pair in pairs]) for side in (0, 1))
-    return Similarity.of_positions(true, own, "yaw" if known.gravity_aligned else "se3")
+    return Similarity.of_positions(true, own, _unmeasured(known))
+
+
+def _unmeasured(known: SlamMap) -> AlignmentMode:
+    """The alignment of what nothing measured of the world of a map."""
+    return "yaw" if known.gravity_aligned else "se3"
 
 
 def errors_in_map(

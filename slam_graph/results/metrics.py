@@ -11,7 +11,7 @@ import importlib
 import math
 import platform
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 from slam_graph import evaluation
 from slam_graph.errors import DataError
 from slam_graph.geometry import StateHistory, Trajectory
-from slam_graph.results.segments import Segments
+from slam_graph.results.segments import Segment, Segments
 from slam_graph.version import __version__
 
 if TYPE_CHECKING:
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from slam_graph.results.run_input import RunInput
     from slam_graph.results.run_logs import RunLogs
 
-SCHEMA_VERSION = 3
+SCHEMA_VERSION = 4
 """Counts up whenever a key changes its name or meaning."""
 
 _RECORDED_PACKAGES = ("gtsam", "numpy", "opencv-python-headless", "scipy")
@@ -84,6 +84,7 @@ def accuracy_table(
     truth: Trajectory | None,
     trajectory: Trajectory | None,
     scaled_camera: gtsam.Pose3 | None = None,
+    breaks_ns: Sequence[int] = (),
 ) -> Table | None:
     """Errors against ground truth, or None where there is nothing to compare.
 
@@ -91,10 +92,11 @@ def accuracy_table(
         truth: the true trajectory.
         trajectory: the estimate.
         scaled_camera: see `evaluation.accuracy_report`.
+        breaks_ns: times between its worlds.
     """
     if truth is None or trajectory is None or len(trajectory) == 0:
         return None
-    return evaluation.accuracy_report(truth, trajectory, scaled_camera)
+    return evaluation.accuracy_report(truth, trajectory, scaled_camera, breaks_ns)
 
 
 def consistency_table(
@@ -102,6 +104,7 @@ def consistency_table(
     history: StateHistory,
     given: bool,
     smoothed: FinalBa | None = None,
+    breaks_ns: Sequence[int] = (),
 ) -> Table | None:
     """NEES against ground truth, or None where there is nothing to compare.
 
@@ -110,11 +113,12 @@ def consistency_table(
         history: the estimate with its covariances.
         given: whether the start was given in the world of the truth.
         smoothed: the smoothed trajectory of the run, by which `nees_of_run` aligns.
+        breaks_ns: times between worlds.
     """
     if truth is None or len(history) == 0:
         return None
     try:
-        return evaluation.consistency_report(truth, history, given, smoothed)
+        return evaluation.consistency_report(truth, history, given, smoothed, breaks_ns)
     except DataError as error:
         return {"unavailable": str(error)}
 
@@ -147,16 +151,19 @@ def extent_table(
     }
 
 
-def world_table(history: StateHistory, given: bool) -> Table:
+def world_table(history: StateHistory, given: bool, breaks_ns: Sequence[int] = ()) -> Table:
     """In which world the estimate lives, and the alignment with a truth that follows from it.
 
     Args:
         history: the causal estimate.
         given: whether the start was given in the world of the truth.
+        breaks_ns: times from which on it lives in another one, of which nothing is known.
     """
+    aligned = given and history.has_scale and not breaks_ns
     return {
         "start_was_given": given,
-        "alignment": "none" if given and history.has_scale else history.free,
+        "world_breaks_ns": list(breaks_ns),
+        "alignment": "none" if aligned else history.free,
         "unmeasured": history.free,
         "scale": "metres" if history.has_scale else "unknown",
     }
@@ -176,28 +183,52 @@ def segments_table(
     trajectory: Trajectory,
     truth: Trajectory | None,
     scaled_camera: gtsam.Pose3 | None = None,
+    smoothed: Trajectory | None = None,
 ) -> list[Table]:
-    """What each segment reached, each aligned on its own; empty for a run in one piece."""
+    """What each segment reached, each aligned on its own; empty for a run in one piece.
+
+    Args:
+        segments: of the run.
+        trajectory: the causal estimate.
+        truth: the true trajectory.
+        scaled_camera: see `evaluation.accuracy_report`.
+        smoothed: the smoothed trajectory.
+    """
     if len(segments) < 2:
         return []
+
+    def errors(segment: Segment, path: Trajectory | None) -> Table | None:
+        part = None if path is None else segment.part_of(path)
+        return accuracy_table(truth, part, scaled_camera)
+
     return [
         {
             "begin_ns": segment.begin_ns,
             "end_ns": segment.end_ns,
             "joined_by": segment.joined_by,
             "ended_by": segment.ended_by,
-            "accuracy": accuracy_table(truth, segment.part_of(trajectory), scaled_camera),
+            "accuracy": errors(segment, trajectory),
+            "smoothed": errors(segment, smoothed),
         }
         for segment in segments
     ]
 
 
-def final_ba_table(final_ba: FinalBa | None, truth: Trajectory | None) -> Table | None:
-    """Size, cost, accuracy and consistency of the final bundle adjustment, if there was one."""
+def final_ba_table(
+    final_ba: FinalBa | None, truth: Trajectory | None, breaks_ns: Sequence[int] = ()
+) -> Table | None:
+    """Size, cost, accuracy and consistency of the final bundle adjustment, if there was one.
+
+    Args:
+        final_ba: the adjustment.
+        truth: the true trajectory.
+        breaks_ns: times between worlds.
+    """
     if final_ba is None:
         return None
-    accuracy = accuracy_table(truth, final_ba.trajectory, final_ba.history.scaled_camera)
-    nees = consistency_table(truth, final_ba.history, given=False, smoothed=final_ba)
+    camera = final_ba.history.scaled_camera
+    accuracy = accuracy_table(truth, final_ba.trajectory, camera, breaks_ns)
+    nees = consistency_table(truth, final_ba.history, False, final_ba, breaks_ns)
     fixes = {} if final_ba.fixes is None else {"fixes": final_ba.fixes.table()}
     return {**asdict(final_ba.summary), "accuracy": accuracy, "nees": nees, **fixes}
 
@@ -207,6 +238,7 @@ def loop_closure_table(
     corrected: Trajectory | None,
     truth: Trajectory | None,
     scaled_camera: gtsam.Pose3 | None = None,
+    breaks_ns: Sequence[int] = (),
 ) -> Table | None:
     """What loop closure found and reached, if loops were to be closed.
 
@@ -215,6 +247,7 @@ def loop_closure_table(
         corrected: the trajectory after loop closure.
         truth: the true trajectory.
         scaled_camera: see `evaluation.accuracy_report`.
+        breaks_ns: times between the worlds that are left.
     """
     if loops is None or corrected is None:
         return None
@@ -222,7 +255,7 @@ def loop_closure_table(
         "keyframes": len(loops.keyframes),
         "verified": len(loops.loops),
         "accepted": int(loops.accepted.sum()),
-        "accuracy": accuracy_table(truth, corrected, scaled_camera),
+        "accuracy": accuracy_table(truth, corrected, scaled_camera, breaks_ns),
     }
 
 

@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
@@ -34,10 +34,16 @@ ALIGNED_IN = {
 CAUSAL, SMOOTHED, LOOPS_CLOSED, IN_MAP = "causal", "smoothed", "loops closed", "in the map"
 _TRUTH = "ground truth"
 
+_TRUTH_ELSEWHERE = "groundtruth_elsewhere"
+"""Warning: the ground truth shares no time with the run."""
+
 _AXES = ("x [m]", "y [m]", "z [m]", "yaw [deg]")
 _COLUMNS = ("AAAAABBB", "CDEF")
 _WIDTHS_INCHES = (5.0, 5.8)
 _HEIGHT_INCHES = 6.6
+
+_UNPLACED_M = 100.0
+"""σ of a position beyond which nothing is known of it."""
 
 _POINTS_REACH = 0.4
 """Features are drawn as far from the path as this part of its largest extent."""
@@ -67,8 +73,7 @@ class PoseEstimate:
 
     def moved(self, similarity: Similarity) -> PoseEstimate:
         """The same in another world; covariances are in the body, in the units of that world."""
-        units = np.repeat([1.0, similarity.scale], 3)
-        covariances = units[:, None] * self.covariances * units
+        covariances = _in_units(self.covariances, np.array([[similarity.scale]]))
         return PoseEstimate(similarity.apply(self.trajectory), covariances)
 
     def at_camera(self, body_T_camera: gtsam.Pose3) -> PoseEstimate:
@@ -85,6 +90,12 @@ class PoseEstimate:
         yaw = np.einsum("nj,njk,nk->n", up, self.covariances[:, :3, :3], up)
         sigmas = np.sqrt(np.maximum(np.column_stack([position, yaw]), 0.0))
         return np.asarray(sigmas * (1.0, 1.0, 1.0, np.degrees(1.0)))
+
+
+def _in_units(covariances: FloatArray, scales: FloatArray) -> FloatArray:
+    """Covariances (N, 6, 6) of poses, rotation first, with lengths times scales (N or 1, 1)."""
+    units = np.hstack([np.ones((len(scales), 3)), np.repeat(scales, 3, axis=1)])
+    return np.asarray(units[:, :, None] * covariances * units[:, None, :])
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,30 +136,49 @@ class RunView:
             self.start_ns,
         )
 
-    def aligned(self, mode: AlignmentMode = "yaw") -> RunView:
+    def aligned(self, mode: AlignmentMode = "yaw", breaks_ns: Sequence[int] = ()) -> RunView:
         """In the world of the truth, by the alignment that fits the best path over its whole.
 
-        The covariances stay relative to the first state.
+        The covariances stay relative to the first state of each world.
 
         Args:
             mode: `yaw` and translation; `se3` where gravity was not measured.
+            breaks_ns: times between worlds. Each is aligned by itself, and paths after loop
+                closure as a whole; of points it is not known in which world they are.
         """
         if self.truth is None:
             return self
         best = self.estimates.get(SMOOTHED, self.estimates[CAUSAL]).trajectory
         try:
-            true, own = evaluation.synchronize(self.truth, best)
-            return self.moved(Similarity.of_positions(true.positions, own.positions, mode))
+            onto = evaluation.ape(self.truth, best, alignment=mode, breaks_ns=breaks_ns).alignment
         except DataError:  # no common time, or what never moves determines no yaw
             return self
+        if not len(breaks_ns):
+            return self.moved(onto.first)
+        estimates, paths = {}, {}
+        for name, own in self.estimates.items():
+            stamps_ns = own.trajectory.stamps_ns
+            known, scales = onto.known(stamps_ns), onto.scales(stamps_ns)
+            covariances = _in_units(own.covariances[known], scales[known, None])
+            places = np.trace(covariances[:, 3:, 3:], axis1=1, axis2=2)
+            covariances[places > _UNPLACED_M**2] = np.nan  # of the worlds to one another
+            estimates[name] = PoseEstimate(onto.apply(own.trajectory), covariances)
+        for name, path in self.paths.items():
+            with suppress(DataError):
+                whole = evaluation.ape(self.truth, path, alignment=mode).alignment
+                paths[name] = whole.apply(path)
+        return replace(self, estimates=estimates, paths=paths, points=np.zeros((0, 3)))
 
 
-def with_path_in_map(view: RunView, path: Trajectory | None) -> RunView:
-    """The view with a path in the world of a map, aligned by itself in yaw and position.
+def with_path_in_map(
+    view: RunView, path: Trajectory | None, located: Mapping[str, Any] | None = None
+) -> RunView:
+    """The view with a path in the world of a map, aligned by itself in what nothing measured there.
 
     Args:
         view: in the world of the truth if there is one.
         path: in the world of the map; None where there is no map.
+        located: what `metrics.json` says of it.
     """
     reference = view.truth
     if reference is None:
@@ -157,13 +187,24 @@ def with_path_in_map(view: RunView, path: Trajectory | None) -> RunView:
         return view
     with suppress(DataError):  # no common time, or what never moves determines no yaw
         there, own = evaluation.synchronize(reference, path)
-        onto = Similarity.of_positions(there.positions, own.positions, "yaw")
+        mode = _alignment_in_map(located)
+        onto = Similarity.of_positions(there.positions, own.positions, mode)
         return replace(view, paths={**view.paths, IN_MAP: onto.apply(path)})
     return view
 
 
+def _alignment_in_map(located: Mapping[str, Any] | None) -> AlignmentMode:
+    """The alignment of what nothing measured of the world of a map; earlier runs do not say it."""
+    mode: AlignmentMode = (located or {}).get("alignment", "yaw")
+    return mode
+
+
 def with_covariances_after_alignment(
-    view: RunView, histories: Mapping[str, StateHistory], given: bool, final_ba: FinalBa | None
+    view: RunView,
+    histories: Mapping[str, StateHistory],
+    given: bool,
+    final_ba: FinalBa | None,
+    breaks_ns: Sequence[int] = (),
 ) -> RunView:
     """The view in the world of the truth, with the covariances of what the alignment leaves.
 
@@ -172,12 +213,15 @@ def with_covariances_after_alignment(
         histories: states of the estimates, by the names of these.
         given: whether the start was given in the world of the truth.
         final_ba: the smoothed trajectory, by which the run is aligned.
+        breaks_ns: times between worlds.
     """
     if view.truth is None:
         return view
-    camera = histories[CAUSAL].scaled_camera
+    camera, free = histories[CAUSAL].scaled_camera, histories[CAUSAL].free
     if camera is not None:  # its path is scaled, and not that of the body
-        return view.at_camera(camera).aligned(histories[CAUSAL].free)
+        return view.at_camera(camera).aligned(free, breaks_ns)
+    if breaks_ns:
+        return view.aligned(free, breaks_ns)
     if given:
         return view
     estimates = {}
@@ -194,7 +238,7 @@ def with_covariances_after_alignment(
                 estimates[name] = PoseEstimate(mapped, covariances)
                 similarity = judged.similarity
     if similarity is None:
-        return view.aligned(histories[CAUSAL].free)
+        return view.aligned(free)
     moved = view.moved(similarity)
     return RunView(
         {**moved.estimates, **estimates}, moved.paths, view.truth, moved.points, view.start_ns
@@ -300,6 +344,19 @@ def _differences(estimate: Trajectory, reference: Trajectory) -> FloatArray:
     return np.column_stack([estimate.positions - reference.positions, yaw])
 
 
+def of_worlds(metrics: Mapping[str, Any]) -> str:
+    """What is to be added to the name of an alignment, where a run is in several worlds."""
+    worlds = len(metrics["extent"].get("world_breaks_ns", [])) + 1
+    return f", each of {worlds} worlds by itself" if worlds > 1 else ""
+
+
+def _no_errors(metrics: Mapping[str, Any]) -> str:
+    """Why there are no errors."""
+    if metrics["warnings"].get(_TRUTH_ELSEWHERE):
+        return "the ground truth shares no time with the run"
+    return "no ground truth" if metrics["accuracy"] is None else "no errors against the truth"
+
+
 def _title(metrics: Mapping[str, Any]) -> str:
     """What was run, how it ended, and the root mean square errors where there is a truth."""
     cameras = metrics["cameras"]
@@ -310,12 +367,12 @@ def _title(metrics: Mapping[str, Any]) -> str:
     ]
     given = metrics["extent"].get("start_was_given", False)
     mode = metrics["extent"].get("alignment", "none" if given else "yaw")
-    loops = metrics["loop_closure"] or {}
+    loops, located = metrics["loop_closure"] or {}, metrics["localization"] or {}
     tables = {
         CAUSAL: (metrics["accuracy"], mode),
         SMOOTHED: ((metrics["final_ba"] or {}).get("accuracy"), mode),
         LOOPS_CLOSED: (loops["accuracy"] if loops.get("accepted") else None, mode),
-        IN_MAP: ((metrics["localization"] or {}).get("accuracy"), "yaw"),
+        IN_MAP: (located.get("accuracy"), _alignment_in_map(located)),
     }
     errors = [
         f"{name} {ate['translation_m']['rmse']:.3f} m, {ate['rotation_deg']['rmse']:.2f}°"
@@ -324,11 +381,11 @@ def _title(metrics: Mapping[str, Any]) -> str:
         if (ate := ((table or {}).get(alignment) or {}).get("ate")) is not None
     ]
     if errors:
-        how = ALIGNED_IN[mode]
+        how = ALIGNED_IN[mode] + of_worlds(metrics)
         lines.append(f"RMSE ({how}): {'  ·  '.join(errors)}")
     elif metrics["extent"]["estimated_frames"]:
         lengths = "" if metrics["extent"].get("scale") != "unknown" else "; lengths up to scale"
-        lines.append(f"no ground truth; ±3σ is relative to the first state{lengths}")
+        lines.append(f"{_no_errors(metrics)}; ±3σ is relative to the first state{lengths}")
     else:
         lines.append(metrics["message"] or "no estimate")
     return "\n".join(lines)

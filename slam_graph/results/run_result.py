@@ -220,8 +220,9 @@ class RunResult(RunSummary):
         if self.groundtruth is None or not len(self.history):
             return None
         try:
+            given, breaks = self.start_was_given, self.segments.breaks_ns()
             found, _ = evaluation.nees_of_run(
-                self.groundtruth, self.history, self.start_was_given, self.final_ba
+                self.groundtruth, self.history, given, self.final_ba, breaks
             )
         except DataError:
             return None
@@ -260,7 +261,8 @@ class RunResult(RunSummary):
         offset_ns = round(self.causal_rig.pose_offset_s * 1e9)
         extent = tables.extent_table(asked, offset_ns, logs.frames, self.trajectory, self.segments)
         frames = max(logs.frames, 1)
-        located = self.localization
+        located, camera = self.localization, self.history.scaled_camera
+        breaks = self.segments.breaks_ns()
         table: dict[str, Any] = tables.finite(
             {
                 "schema_version": tables.SCHEMA_VERSION,
@@ -277,16 +279,14 @@ class RunResult(RunSummary):
                 }
                 | ({"of_truth": asked.truth_of_fixes} if self.georeferenced else {})
                 | ({} if self.fix_calibration is None else self.fix_calibration.table()),
-                "extent": extent | tables.world_table(self.history, self.start_was_given),
+                "extent": extent | tables.world_table(self.history, self.start_was_given, breaks),
                 "segments": tables.segments_table(
-                    self.segments, self.trajectory, truth, self.history.scaled_camera
+                    self.segments, self.trajectory, truth, camera, self.smoothed
                 ),
-                "accuracy": tables.accuracy_table(
-                    truth, self.trajectory, self.history.scaled_camera
-                ),
-                "final_ba": tables.final_ba_table(self.final_ba, truth),
+                "accuracy": tables.accuracy_table(truth, self.trajectory, camera, breaks),
+                "final_ba": tables.final_ba_table(self.final_ba, truth, breaks),
                 "loop_closure": tables.loop_closure_table(
-                    self.loops, self.loop_closed, truth, self.history.scaled_camera
+                    self.loops, self.loop_closed, truth, camera, self.segments.breaks_ns(True)
                 ),
                 "slam_map": None if self.slam_map is None else self.slam_map.summary(),
                 "localization": (
@@ -296,7 +296,7 @@ class RunResult(RunSummary):
                 ),
                 "moving_objects": objects_table(self.objects, asked, self.estimated_rig),
                 "nees": tables.consistency_table(
-                    truth, self.history, self.start_was_given, self.final_ba
+                    truth, self.history, self.start_was_given, self.final_ba, breaks
                 ),
                 "nis": evaluation.innovation_report(logs.innovations.columns()),
                 "evidence": self.evidence,
@@ -364,6 +364,6 @@ class RunResult(RunSummary):
         loops, truth, began_ns = self._paths_of_loops(), self.groundtruth, self.input.states_ns[0]
         view = RunView(estimates, loops, truth, self.points, began_ns)
         view = with_covariances_after_alignment(
-            view, histories, self.start_was_given, self.final_ba
+            view, histories, self.start_was_given, self.final_ba, self.segments.breaks_ns()
         )
-        return with_path_in_map(view, self.in_map)
+        return with_path_in_map(view, self.in_map, self.metrics["localization"])

@@ -17,7 +17,13 @@ from slam_graph.datasets import Sequence
 from slam_graph.display import Displayed
 from slam_graph.errors import DataError, closest
 from slam_graph.geometry import Trajectory
-from slam_graph.results.run_picture import ALIGNED_IN, LOOPS_CLOSED, RunView, run_figure
+from slam_graph.results.run_picture import (
+    ALIGNED_IN,
+    LOOPS_CLOSED,
+    RunView,
+    of_worlds,
+    run_figure,
+)
 from slam_graph.results.scene import SceneParts, export_scene
 from slam_graph.results.scene_files import (
     SCENE_FORMATS,
@@ -210,6 +216,7 @@ class RunSummary(Displayed):
             "scale": "unknown: lengths are up to scale"
             if extent.get("scale") == "unknown"
             else None,
+            "worlds": of_worlds(metrics).removeprefix(", ") or None,
             "error": _errors(metrics["accuracy"], mode),
             "error, smoothed": _errors((metrics["final_ba"] or {}).get("accuracy"), mode),
             "error, loops closed": _errors(loops["accuracy"], mode)

@@ -72,6 +72,7 @@ class _Extent(_Table):
     alignment: _Alignment = "yaw"
     unmeasured: _Alignment = "yaw"
     scale: str = ""
+    world_breaks_ns: list[_Time] = []
 
 
 class _Timing(_Table):
@@ -91,6 +92,7 @@ class _Loops(_Table):
 
 class _Localization(_Table):
     accuracy: _Accuracy | None = None
+    alignment: _Alignment = "yaw"
 
 
 class _World(_Table):

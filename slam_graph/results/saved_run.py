@@ -284,9 +284,11 @@ class SavedRun(RunSummary):
         )
         if self.scaled_camera is not None and view.truth is not None:
             view = view.at_camera(self.scaled_camera)
-        mode = self.metrics["extent"].get("alignment", "yaw")
-        view = view if self.start_was_given else view.aligned(mode)
-        return with_path_in_map(view, self.in_map)
+        extent = self.metrics["extent"]
+        breaks = extent.get("world_breaks_ns", [])
+        if breaks or not self.start_was_given:
+            view = view.aligned(extent.get("alignment", "yaw"), breaks)
+        return with_path_in_map(view, self.in_map, self.metrics["localization"])
 
     @cached_property
     def _states(self) -> tuple[IntArray, dict[str, FloatArray]]:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from itertools import pairwise
 from typing import Any, ClassVar, Literal, Protocol
 
 import gtsam
@@ -202,6 +203,19 @@ class Segments:
                 groups.append([])
             groups[-1].append(segment)
         return groups
+
+    def breaks_ns(self, loops_closed: bool = False) -> list[int]:
+        """(W - 1,) times between worlds: halfway from the end of one to the begin of the next.
+
+        Args:
+            loops_closed: whether worlds that loop closures have joined are one.
+        """
+        worlds = self.worlds()
+        return [
+            (before[-1].end_ns + world[0].begin_ns) // 2
+            for before, world in pairwise(worlds)
+            if not (loops_closed and any(segment.loops for segment in world))
+        ]
 
     def csv_lines(self, trajectory: Trajectory) -> Iterator[str]:
         """Segments as CSV; times between two of them have no state.

@@ -9,14 +9,15 @@ from __future__ import annotations
 
 from typing import Any, Protocol
 
+import gtsam
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.backend import BackendConfig
 from slam_graph.errors import DataError
-from slam_graph.evaluation import mean_bounds, synchronize
+from slam_graph.evaluation import mean_bounds
 from slam_graph.geometry import AlignmentMode, Similarity, Trajectory
+from slam_graph.sensors import Rig
 from slam_graph.visualization.rerun_palette import (
     CAUSAL,
     IN_MAP,
@@ -31,6 +32,7 @@ from slam_graph.visualization.rerun_palette import (
 from slam_graph.visualization.rerun_series import SeriesLog, three_sigma
 from slam_graph.visualization.rerun_states import style_ellipsoids
 from slam_graph.visualization.rerun_stream import RerunStream
+from slam_graph.visualization.rerun_truth import JudgedRun, placed_truth
 
 PATH_RADII = {CAUSAL: -2.0, SMOOTHED: -1.1, LOOP: -1.6, TRUTH: -0.7, IN_MAP: -2.6}
 """Of paths, negative: in pixels of the screen. They differ, as paths lie on one another."""
@@ -44,12 +46,14 @@ _TRUTH_POINTS = 2000
 LEGEND = """\
 # What is shown
 
-**Space.** Light blue: causal path. Red: smoothed path. Light grey: ground truth, aligned in yaw
-and position over the whole run. Small points: the map, coloured by height (dark blue is low, yellow
-is high). Larger points are features of this frame: green, in the state; yellow, used in this step;
-red, rejected by the gate. White points: past poses in the window; purple: keyframes of the
-algorithm or, where it has none, of loop closure or of the map, at the end of the run. Green: loop
-closures, large points at their ends, and the path after them. The arrow at the start is gravity.
+**Space.** Light blue: causal path. Red: smoothed path. Light grey: ground truth, aligned in what
+nothing measured (with an IMU yaw and position; without one rotation and position; with one camera
+alone scale, too) over the whole run, or over each of its worlds. Small points: the map, coloured by
+height (dark blue is low, yellow is high). Larger points are features of this frame: green, in the
+state; yellow, used in this step; red, rejected by the gate. White points: past poses in the
+window; purple: keyframes of the algorithm or, where it has none, of loop closure or of the map, at
+the end of the run. Green: loop closures, large points at their ends, and the path after them. The
+arrow at the start is gravity.
 Ellipsoids at the body: 1σ and 3σ of its position. A dense cloud is the last depth image, coloured
 by depth. Orange points with ellipsoids (1σ) are position fixes, with axes known poses; red,
 rejected by the gate.
@@ -63,7 +67,8 @@ tracked; yellow, new; light blue, seen by another camera too; red, rejected by t
 rejected by RANSAC; purple, moves by itself. White points: landmarks projected into the image; red
 lines: their residuals, ten times as long.
 
-**Plots.** x red, y green, z light blue, thin lines ±3σ. Errors are in the axes of the body.
+**Plots.** x red, y green, z light blue, thin lines ±3σ. Errors are in the axes of
+the body, in metres; with one camera alone those of the camera, in its axes.
 """
 
 
@@ -82,6 +87,11 @@ class FinishedRun(Protocol):
     @property
     def config(self) -> RunSettings:
         """Its settings."""
+        ...
+
+    @property
+    def rig(self) -> Rig:
+        """The sensors."""
         ...
 
     @property
@@ -142,14 +152,15 @@ class OutcomeLog:
         stream: where it goes.
         world: entity of the world of the run.
         series: of the plots.
-        stamps_ns: times of all frames, by which rows get the numbers of their frames.
+        times_ns: of the states at all frames, on their clock, by which rows get the numbers of
+            their frames.
     """
 
     def __init__(
-        self, stream: RerunStream, world: str, series: SeriesLog, stamps_ns: list[int]
+        self, stream: RerunStream, world: str, series: SeriesLog, times_ns: list[int]
     ) -> None:
         self._stream, self._world, self._series = stream, world, series
-        self._stamps_ns = stamps_ns
+        self._times_ns = times_ns
         self._truth_sent = False
 
     def show(self, run: FinishedRun) -> frozenset[str]:
@@ -201,9 +212,9 @@ class OutcomeLog:
                 self._series.send(f"{entity}/bounds", frames, causal.stamps_ns, bounds)
         return frozenset(shown)
 
-    def frames(self, stamps_ns: IntArray) -> IntArray:
-        """(N,) numbers of the last frames at or before some times."""
-        found = np.searchsorted(self._stamps_ns, stamps_ns, "right") - 1
+    def frames(self, times_ns: IntArray) -> IntArray:
+        """(N,) numbers of the last frames whose states are at or before some times."""
+        found = np.searchsorted(self._times_ns, times_ns, "right") - 1
         return np.asarray(np.maximum(found, 0), np.int64)
 
     def path(self, entity: str, trajectory: Trajectory, colour: Colour) -> None:
@@ -225,20 +236,46 @@ class OutcomeLog:
         )
         self._stream.log(entity, lines, static=True)
 
-    def show_truth(self, truth: Trajectory, estimate: Trajectory, alignment: AlignmentMode) -> None:
-        """Log the true path in the world of the estimate, fitted over what both share."""
+    def show_truth(
+        self,
+        truth: Trajectory,
+        estimate: Trajectory,
+        alignment: AlignmentMode,
+        camera: gtsam.Pose3 | None = None,
+    ) -> None:
+        """Log the true path in the world of the estimate, fitted over what both share.
+
+        Args:
+            truth: of the body.
+            estimate: of the body.
+            alignment: of the two.
+            camera: body_T_camera of the camera whose path is known up to a scale, by which they are
+                aligned then.
+        """
+        fitted = (estimate, truth)
+        if camera is not None:
+            fitted = (estimate.mounted(camera), truth.mounted(camera))
         try:
-            onto = _onto(estimate, truth, alignment)
+            onto = placed_truth(*fitted, alignment)
         except DataError:
             return
-        rr, entity = self._stream.rr, f"{self._world}/path/groundtruth"
         if not self._truth_sent and len(truth):
             self._truth_sent = True
-            step = -(-len(truth) // _TRUTH_POINTS)
-            line = rr.LineStrips3D([truth.positions[::step]], colors=TRUTH, radii=PATH_RADII[TRUTH])
-            self._stream.log(entity, line, static=True)
-        placed = rr.Transform3D(translation=onto.translation, mat3x3=onto.rotation)
-        self._stream.log(entity, placed, static=True)
+            self._send_truth([truth.positions])
+        self._place_truth(onto)
+
+    def _send_truth(self, paths: list[FloatArray]) -> None:
+        """Log true paths, each (M, 3)."""
+        step = -(-sum(map(len, paths)) // _TRUTH_POINTS)
+        thinned = [path[::step] for path in paths if len(path)]
+        line = self._stream.rr.LineStrips3D(thinned, colors=TRUTH, radii=PATH_RADII[TRUTH])
+        self._stream.log(f"{self._world}/path/groundtruth", line, static=True)
+
+    def _place_truth(self, onto: Similarity) -> None:
+        """Log where the true paths are in the world of the estimate."""
+        matrix = onto.scale * onto.rotation
+        placed = self._stream.rr.Transform3D(translation=onto.translation, mat3x3=matrix)
+        self._stream.log(f"{self._world}/path/groundtruth", placed, static=True)
 
     def show_gravity(self, position: FloatArray) -> None:
         """Log the direction of gravity at the start of the path."""
@@ -310,29 +347,21 @@ class OutcomeLog:
         truth, causal = run.groundtruth, run.trajectory
         if truth is None or len(causal) == 0:
             return False
-        best = causal if run.smoothed is None else run.smoothed
-        alignment = run.metrics["extent"].get("alignment", "yaw")
-        self.show_truth(truth, best, alignment)
+        judged = JudgedRun.of(run, truth)
         try:
-            moved = _onto(causal, truth, alignment).apply(truth)
-            true, own = synchronize(moved, causal)
+            if judged.breaks_ns:
+                self._send_truth(judged.true_paths(truth))
+                self._place_truth(Similarity.identity())
+            else:
+                self.show_truth(truth, run.smoothed or causal, judged.alignment, judged.camera)
+            stamps_ns, errors = judged.errors()
         except DataError:
             return False
-        rows = np.searchsorted(causal.stamps_ns, own.stamps_ns)
-        rotations = Rotation.from_quat(own.quaternions)
-        turned = (rotations.inv() * Rotation.from_quat(true.quaternions)).as_rotvec()
-        errors: dict[str, tuple[FloatArray, Any]] = {
-            "error/position": (
-                rotations.inv().apply(true.positions - own.positions),
-                run.sigmas[rows, 3:6],
-            ),
-            "error/orientation": (np.rad2deg(turned), np.rad2deg(run.sigmas[rows, :3])),
-        }
-        frames = self.frames(own.stamps_ns)
+        frames = self.frames(stamps_ns)
         for entity, (values, sigmas) in errors.items():
-            self._series.send(entity, frames, own.stamps_ns, values)
+            self._series.send(entity, frames, stamps_ns, values)
             band = three_sigma(np.zeros_like(values), sigmas)
-            self._series.send(f"{entity}/bounds", frames, own.stamps_ns, band)
+            self._series.send(f"{entity}/bounds", frames, stamps_ns, band)
         return True
 
     def _show_nees(self, stamps_ns: IntArray, values: FloatArray) -> None:
@@ -341,15 +370,3 @@ class OutcomeLog:
         low, high = mean_bounds(3, 1)
         bounds = np.tile([high, low], (len(values), 1))
         self._series.send("consistency/nees/bounds", frames, stamps_ns, bounds)
-
-
-def _onto(estimate: Trajectory, truth: Trajectory, alignment: AlignmentMode) -> Similarity:
-    """The map from the world of the truth to that of an estimate.
-
-    Raises:
-        DataError: if the two share no time, or determine no yaw.
-    """
-    if alignment == "none":
-        return Similarity.identity()
-    true, own = synchronize(truth, estimate)
-    return Similarity.of_positions(own.positions, true.positions, alignment)

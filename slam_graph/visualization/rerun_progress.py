@@ -110,7 +110,7 @@ class StepSeries:
         self._series = series
 
     def add(self, number: int, stamp_ns: int, frame: ShownFrame, estimator: Estimator) -> None:
-        """Add the rows of a frame."""
+        """Add the rows of a frame, at the time of its state."""
         add_imu(self._series, number, frame.packet)
         add = self._series.add
         ms, counts = frame.milliseconds, frame.counts

@@ -74,13 +74,14 @@ class RerunViewer:
         self._fixes = FixViews(self._stream)
         self._log_handler = _LogHandler(self._stream)
         self._truth: Trajectory | None = None
-        self._stamps_ns: list[int] = []
+        self._stamps_ns: list[int] = []  # of the frames
+        self._times_ns: list[int] = []  # of the states at them, on their clock
         self._begin("world")
 
     def _begin(self, world: str) -> None:
         """Begin with an empty world; a run that starts anew is in another one than before."""
         self._world = world
-        self._outcome = OutcomeLog(self._stream, world, self._series, self._stamps_ns)
+        self._outcome = OutcomeLog(self._stream, world, self._series, self._times_ns)
         self._history = StateHistory()
         self._states = StateRows(self._stream, world)
         self._ids, self._points = np.zeros(0, np.int64), np.zeros((0, 3))
@@ -143,7 +144,9 @@ class RerunViewer:
         """
         features = frame.features
         number, stamp_ns = len(self._stamps_ns), features.stamp_ns
+        time_ns = self._time_of_state(frame)
         self._stamps_ns.append(stamp_ns)
+        self._times_ns.append(time_ns)
         self._stream.at(number, stamp_ns)
         if frame.restarted:
             self._states.flush()
@@ -159,7 +162,7 @@ class RerunViewer:
         if frame.objects is not None:
             self._objects.show(frame.objects, features)
         self._fixes.show(frame, estimator)
-        self._steps.add(number, stamp_ns, frame, estimator)
+        self._steps.add(number, time_ns, frame, estimator)
         if frame.state is None:
             return
         if not frame.waits:
@@ -168,7 +171,7 @@ class RerunViewer:
         if not len(self._history) and estimator.rig.has_imu:
             self._outcome.show_gravity(np.asarray(frame.state.world_T_body.translation()))
         self._history.append(frame.state)
-        self._states.add(number, stamp_ns, frame.state)
+        self._states.add(number, time_ns, frame.state)
         self._show_features(frame, estimator)
         self._show_window(estimator)
         if self._detail == "graph":
@@ -176,7 +179,17 @@ class RerunViewer:
         if self._truth is not None and number % _ALIGN_FRAMES == 0:
             free = StateHistory(estimator.rig.has_imu, estimator.rig.scaled_camera).free
             alignment: AlignmentMode = "none" if estimator.start_is_given else free
-            self._outcome.show_truth(self._truth, self._history.trajectory(), alignment)
+            own, camera = self._history.trajectory(), estimator.rig.scaled_camera
+            self._outcome.show_truth(self._truth, own, alignment, camera)
+
+    def _time_of_state(self, frame: ShownFrame) -> int:
+        """Time of the state at a new frame, on the clock of the states, which the truth has too."""
+        if frame.state is not None and not frame.waits:
+            return frame.state.stamp_ns
+        offset_ns = round(self._rig.pose_offset_s * 1e9)
+        if self._times_ns:  # it may be estimated
+            offset_ns = self._times_ns[-1] - self._stamps_ns[-1]
+        return frame.features.stamp_ns + offset_ns
 
     def finish(self, result: FinishedRun) -> None:
         """Send what is known at the end only, and show everything at once."""

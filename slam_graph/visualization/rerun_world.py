@@ -77,7 +77,8 @@ def show_saved_run(stream: RerunStream, run: FinishedRun, details: SavedDetails)
     """
     series = SeriesLog(stream)
     stamps_ns = np.asarray(details.timing.get("stamp_ns", run.trajectory.stamps_ns), np.int64)
-    outcome = OutcomeLog(stream, "world", series, stamps_ns.tolist())
+    times_ns = np.asarray(details.by_frame.get("state_ns", stamps_ns), np.int64)
+    outcome = OutcomeLog(stream, "world", series, times_ns.tolist())
     stream.log("world", stream.rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
     plots = outcome.show_states(run) | outcome.show(run)
     outcome.show_points(details.points)
@@ -92,7 +93,7 @@ def show_saved_run(stream: RerunStream, run: FinishedRun, details: SavedDetails)
         views = CameraViews(stream, details.rig, "world/body")
         views.mount(details.rig)
         if details.recording is not None:
-            plots |= _show_inputs(stream, series, views, details, outcome, stamps_ns)
+            plots |= _show_inputs(stream, series, views, details, stamps_ns)
             cameras = _cameras_shown(details.recording, details.images)
     if details.known_map is not None:
         log_map(stream, KNOWN_MAP, details.known_map)
@@ -178,7 +179,6 @@ def _show_inputs(
     series: SeriesLog,
     cameras: CameraViews,
     details: SavedDetails,
-    outcome: OutcomeLog,
     stamps_ns: IntArray,
 ) -> frozenset[str]:
     """Images or tracks, and IMU samples, of the frames (F,) of a run.
@@ -188,12 +188,12 @@ def _show_inputs(
     """
     assert details.recording is not None
     inputs = _Inputs(stream, series, cameras, details.recording.rig, details.images, details.aiding)
-    known, shown = set(stamps_ns.tolist()), 0
+    numbers, shown = {stamp_ns: k for k, stamp_ns in enumerate(stamps_ns.tolist())}, 0
     for packet in details.recording.packets():
-        if packet.frame.stamp_ns not in known:
+        number = numbers.get(packet.frame.stamp_ns)
+        if number is None:
             continue
         shown += 1
-        number = int(outcome.frames(np.array([packet.frame.stamp_ns]))[0])
         inputs.show(number, packet)
     series.flush()
     if not shown:
