@@ -112,14 +112,16 @@ def test_a_short_way_is_aligned_in_spite_of_noise(mode: str) -> None:
     assert Rotation.from_matrix(found.rotation).as_rotvec() == pytest.approx([0, 0, 0.5], abs=0.3)
 
 
-def test_a_line_with_noise_has_no_roll_and_its_yaw_is_known() -> None:
+@pytest.mark.parametrize("mode", ["se3", "sim3", "yaw"])
+def test_a_line_with_noise_is_aligned_along_it(mode: str) -> None:
     rng = np.random.default_rng(1)
     way = np.column_stack([np.linspace(0.0, 5.0, 300), np.zeros((300, 2))])
     truth, estimate = (way + rng.normal(size=(300, 3)) * 1e-3 for _ in range(2))
-    with pytest.raises(DataError, match="cannot align"):
-        Similarity.of_positions(truth, estimate, "se3")
-    found = Similarity.of_positions(truth, estimate, "yaw")
-    assert Rotation.from_matrix(found.rotation).magnitude() < 1e-3
+    turned = estimate @ Rotation.from_euler("z", 0.5).as_matrix()
+    found = Similarity.of_positions(truth, turned, mode)
+    left = truth - (found.scale * turned @ found.rotation.T + found.translation)
+    assert np.abs(left).max() < 0.01
+    assert found.scale == pytest.approx(1.0, abs=1e-3)
 
 
 def test_nearest_agrees_with_brute_force() -> None:

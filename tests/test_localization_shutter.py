@@ -45,7 +45,7 @@ def _localization(mounted: Rig, monkeypatch: pytest.MonkeyPatch) -> mapping.Loca
         config=load_config(),
         input=SimpleNamespace(rig=mounted, info=SimpleNamespace(name="flight")),
         causal_rig=mounted,
-        logs=SimpleNamespace(calibration=SimpleNamespace(rig=lambda known: known)),
+        estimated_rig=mounted,
         begin_localization=lambda known: log,
     )
     return mapping.Localization(cast(RunResult, result), cast(SlamMap, None), Diagnostics())

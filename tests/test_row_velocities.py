@@ -101,7 +101,7 @@ def test_rows_move_with_the_newest_estimates(name: str) -> None:
     assert window is not None
     state = window.state
     moving = [*window.moving, window.frame]
-    assert len(moving) == {"msckf": 1, "okvis": 6}[name]
+    assert (len(moving) > 1) == (name == "okvis")
     assert set(state.motions) == {*window.past, window.frame}
     for i in moving:
         body_R_world = state.frames.atPose3(X(i)).rotation().inverse()

@@ -23,11 +23,11 @@ AlignmentMode = Literal["none", "yaw", "se3", "sim3", "scale"]
 ALIGNMENT_MODES: tuple[AlignmentMode, ...] = get_args(AlignmentMode)
 
 _LEAST_CORRELATION = 0.5
-"""Positions determine a rotation where those of the estimate and of the reference are correlated as
-much as this in the plane that it turns. With less, the part that they do not have in common is 1.7
-times the one that they have, and the angle has a standard deviation of a radian or more, as errors
-along a path are so correlated that only a few count. Something that stands, seen with noise, has
-1/√N; a short way that is seen at all has nearly 1."""
+"""Positions determine an alignment where those of the estimate and of the reference are correlated
+as much as this after it. With less, the part that they do not have in common is 1.7 times the one
+that they have. Something that stands, seen with noise, has a few times 1/√N; a short way that is
+seen at all has nearly 1. What moves along a line is aligned with it, though the rotation about the
+line is one of noise."""
 _RELATIVE_RANK = 1e-14
 """A correlation, or a singular value over the largest one, below this counts as zero."""
 
@@ -125,21 +125,19 @@ def _umeyama(
         reference: (N, 3) points, N ≥ 3.
         estimate: (N, 3) the same points in another frame.
         with_scale: estimate the scale too (Sim(3)); otherwise it is 1 (SE(3)).
-        least: correlation of the points, along the two axes on which they differ least, with which
-            their rotation about the third is defined.
+        least: correlation of the points with which their rotation is defined.
 
     Raises:
-        DataError: if the points lie on one line or coincide, but for what is not the same in both:
+        DataError: if the points lie on one line, or coincide but for what is not the same in both:
             their rotation is undefined.
     """
     mean_reference, mean_estimate = reference.mean(axis=0), estimate.mean(axis=0)
     centred, wanted = estimate - mean_estimate, reference - mean_reference
     covariance = wanted.T @ centred / len(reference)
     U, d, Vt = np.linalg.svd(covariance)
-    across = (wanted @ U[:, 1:], centred @ Vt[1:].T)
-    common = len(reference) * float(d[1:].sum())  # as well in a mirror, which is no matter of noise
+    common = len(reference) * float(d.sum())  # as well in a mirror, which is no matter of noise
     is_line = len(reference) < 3 or d[1] <= _RELATIVE_RANK * max(d[0], np.finfo(float).tiny)
-    if is_line or not _determined(common, *across, least):
+    if is_line or not _determined(common, wanted, centred, least):
         raise DataError(
             f"cannot align {len(reference)} positions that lie on one line or coincide; "
             "use --align none or yaw, or a recording that moves"
@@ -152,12 +150,12 @@ def _umeyama(
 
 
 def _determined(common: float, reference: FloatArray, estimate: FloatArray, least: float) -> bool:
-    """Whether points determine the angle about an axis.
+    """Whether points determine a rotation.
 
     Args:
-        common: Σ r·e of the two in the plane across the axis, at the best angle.
-        reference: (N, 2) the points r in that plane, with a mean of zero.
-        estimate: (N, 2) the same e.
+        common: Σ r·e of the two, at the best rotation.
+        reference: (N, 2 or 3) the points r that it turns, with a mean of zero.
+        estimate: (N, 2 or 3) the same e.
         least: correlation of the two with which they do.
     """
     sizes = float(np.linalg.norm(reference)) * float(np.linalg.norm(estimate))
