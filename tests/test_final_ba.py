@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The bundle adjustment over a whole recording: exact, complete, never in the way."""
 
+from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -15,11 +16,13 @@ from flight import FISHEYE, rig
 
 from slam_graph.backend.backend_config import BackendConfig
 from slam_graph.backend.smoothing import final_adjustment
+from slam_graph.backend.smoothing.causal_outliers import causal_outliers
 from slam_graph.backend.smoothing.final_adjustment import FinalBa, adjust_recording, segments
 from slam_graph.backend.smoothing.frame_log import FrameLog
 from slam_graph.backend.smoothing.keyframe_states import state_at
 from slam_graph.backend.smoothing.recording_factors import nearest_keyframe
 from slam_graph.backend.smoothing.smoothing_config import FinalBaConfig
+from slam_graph.backend.smoothing.smoothing_task import SmoothingTask
 from slam_graph.config import load_config
 from slam_graph.datasets.calibration.kalibr_calibration import write_kalibr
 from slam_graph.datasets.dataset_registry import open_dataset
@@ -28,6 +31,7 @@ from slam_graph.evaluation.absolute_pose_error import ape
 from slam_graph.geometry.trajectory import Trajectory
 from slam_graph.pipeline.run_recording import run
 from slam_graph.results.run_result import RunResult
+from slam_graph.sensors import FeatureFrame
 from slam_graph.sensors.camera import Camera
 from slam_graph.simulation.simulated_sequence import SimulatedSequence
 from slam_graph.simulation.simulation_config import (
@@ -274,6 +278,25 @@ def test_a_minimum_that_contradicts_the_causal_estimate_does_not_go_unsaid(
     result = run(flight(2, 1.0, duration_s=4.0), min_coverage=0.1)
     assert asked == [False, True]
     assert result.warnings["smoothed_contradicts"] == still_apart
+
+
+def test_what_does_not_fit_the_causal_trajectory_is_what_moves(keep: Keep) -> None:
+    """A box that rotates and glides by; a feature that one frame alone sees says nothing."""
+    kept = keep(flight(2, sigma=1.0, objects={"count": 1, "masks": True}))
+    on_box, frames = set[int](), Counter[int]()
+    for packet in kept.sequence.packets():
+        assert isinstance(packet.frame, FeatureFrame)
+        seen = packet.frame.cameras[0]
+        assert seen.labels is not None
+        on_box.update(seen.ids[seen.labels > 0].tolist())
+        frames.update(seen.ids.tolist())
+    long = {track for track, count in frames.items() if count > 5}
+    task = SmoothingTask.of(kept.sequence.rig, BackendConfig(), DEFAULT)
+    found = set(causal_outliers(kept.log, kept.truth, task).tolist())
+    assert len(found & on_box & long) > 0.8 * len(on_box & long) > 5
+    assert len((found & long) - on_box) < 0.03 * len(long - on_box)
+    nothing = kept.truth.select(np.zeros(len(kept.truth), np.bool_))
+    assert not len(causal_outliers(kept.log, nothing, task))
 
 
 def test_where_there_is_nothing_to_gain_the_causal_estimate_is_left_alone() -> None:

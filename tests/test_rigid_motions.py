@@ -99,6 +99,25 @@ def test_a_box_that_moves_from_the_first_frame_on_does_not_take_the_run_with_it(
     assert len(result.trajectory) >= 39
 
 
+def test_a_world_that_fixes_tell_after_that_has_all_states_since_the_start() -> None:
+    """The estimate begins again without the box, and is in the world of the fixes later."""
+    sequence = simulate(
+        trajectory="figure8",
+        duration_s=3.0,
+        cameras=2,
+        with_imu=False,
+        objects={"count": 1},
+        flight={"hover_s": 0.0},
+        gnss={"sigma_m": 0.02, "rate_hz": 5.0},
+    )
+    result = run(sequence, algorithm="msckf", final_ba={"enabled": False})
+    assert result.georeferenced
+    assert result.groundtruth is not None
+    assert result.trajectory.stamps_ns[0] == result.groundtruth.stamps_ns[0]
+    assert len(result.trajectory) == result.logs.frames
+    assert ape(result.groundtruth, result.trajectory, alignment="none").statistics.rmse < 0.1
+
+
 def test_a_run_says_so_where_most_of_what_it_sees_moves() -> None:
     sequence = flight(0, 1.5, size_m=3.0, points=600)
     result = run(sequence, algorithm="msckf", final_ba={"enabled": False})

@@ -63,7 +63,6 @@ class Estimator(EstimatorKnowledge):
         solved_ns: stamp of the last frame that was taken, on the clock of the cameras.
         report: what is known of the last step besides the state.
         aiding: takes position fixes and odometry up to the next frame.
-        clock_change: found at the last frame: the state is wrong since then; see `begin_segment`.
         clock_changes: those that are corrected in the IMU samples.
         LEAD_NS: a given state may be so much older than the first frame: the IMU reaches so far.
     """
@@ -150,11 +149,6 @@ class Estimator(EstimatorKnowledge):
         self._engine = self._make_engine(self._context)  # nothing is left of an earlier start
         self.aiding.restart()
 
-    def find_clock_change(self) -> clock_change.ClockChange | None:
-        """The change of the clock that explains why an estimate is lost, if there is one."""
-        self.clock_change = self.clock_change or self._check.clock_change(self._context.imu)
-        return self.clock_change
-
     def begin_segment(self, before: NavState | None, measured: bool = True) -> None:
         """Forget the state, which is lost, and start again with the frames that follow.
 
@@ -207,10 +201,9 @@ class Estimator(EstimatorKnowledge):
         From then on, and after a change of the clock, a frame waits until the IMU has reached it.
 
         Returns:
-            The causal estimate with its covariance, stamped on the clock of the IMU. None as long
-            as there is no state, for a frame that does not follow those before, and for one that
-            waits; where one has waited, the state may be that of an earlier frame, and `states`
-            has all that were found.
+            The causal estimate with its covariance, stamped on the clock of the IMU; of an earlier
+            frame where that one has waited (`states` has all). None as long as there is no state,
+            for a frame that does not follow those before, and for one that waits.
         """
         with self._single_thread.held():
             self.replayed = self.clock_change = None
@@ -233,8 +226,9 @@ class Estimator(EstimatorKnowledge):
 
     def _take(self, frame: FeatureFrame) -> NavState | None:
         """The state at a frame; all of them anew once fixes tell where their world is."""
-        self._motions.keep(frame)
         state = self._solve(frame)
+        if state is not None and self._moves_since_start(state):
+            return self._without_what_moves()
         found = None if self.window is None else self.aiding.alignment(state)
         if self.window is None or found is None:
             return state if self.window is None else self._moved_by_fixes(self.window, state)
@@ -250,13 +244,14 @@ class Estimator(EstimatorKnowledge):
         self.report, self.solved_ns = StepReport(), frame.stamp_ns
         imu, calibration = self._context.imu, self._context.calibration
         self._dynamics.extend(imu, frame.stamp_ns + round(self.rig.end_offset_s * 1e9))
-        state = self.window.state if self.window is not None else None
+        state = None if self.window is None else self.window.state
         stamp_ns = calibration.stamp(frame.stamp_ns, state, imu)
         if not self._latest_ns < stamp_ns <= imu.newest_ns() + _MAX_AHEAD_NS:
             message = f"frame at {frame.stamp_ns} ns does not follow the frames and the IMU"
             self.diagnostics.warn("frame_out_of_order", message)
             return None
         self._latest_ns = self.times_ns[frame.stamp_ns] = stamp_ns
+        self._motions.keep(frame)
         imu.forget_before(stamp_ns - _HISTORY_NS)
         frame = with_depth_observed(frame, self._real_rig)
         frame, bad = frame.usable(len(self.rig.cameras))
@@ -274,31 +269,40 @@ class Estimator(EstimatorKnowledge):
         elif stamp_ns > self.window.stamp_ns:
             stepped = self._engine.step(self.window, stamp_ns, frame, still_sigma, self.report)
             solved = self._dynamics.reported(stepped)
-            return self._compared(whole, self._reviewed(whole, solved, still_sigma is not None))
+            return self._reviewed(whole, solved, still_sigma is not None)
         elif stamp_ns == self.window.stamp_ns:
             self._context.add_observations(self.window, frame)
             self._context.note(frame)
         if self.window is None or stamp_ns < self.window.stamp_ns:
             return None
-        first = self._dynamics.reported(self.window.current(self.window.prior))
-        return self._compared(whole, first)
+        return self._dynamics.reported(self.window.current(self.window.prior))
 
-    def _compared(self, frame: FeatureFrame, state: NavState) -> NavState | None:
-        """The state, or that of an estimate that began again without what moves."""
-        if not self._motions.wanted:
-            return state
-        again = self._motions.compare(frame, state, self.motion, self.assumed_noise_px)
-        if self.window is not None:
-            self.window.tracks.remove(Outcome.DYNAMIC, self._motions.moving_of(frame))
-        if not again:
-            return state
-        given, frames = self._given, self._motions.begin_again()
+    def _moves_since_start(self, state: NavState) -> bool:
+        """Whether the last frame shows that something has moved since the start; it is left out."""
+        motions, window = self._motions, self.window
+        if not motions.wanted or window is None:
+            return False
+        again = motions.compare(state, self.motion, self.assumed_noise_px)
+        window.tracks.remove(Outcome.DYNAMIC, motions.moving_now)
+        return again
+
+    def _without_what_moves(self) -> NavState | None:
+        """The last state of an estimate that begins again without what moves."""
+        given, frames, states = self._given, self._motions.begin_again(), list[NavState]()
         self._begin(self._context.imu)
         if given is not None:
             self.start(given, with_rate=True)
-        states = [solved for kept in frames if (solved := self._solve(kept)) is not None]
+        for frame in frames:
+            states = self._with_next(states, frame)
         self.states = self.replayed = states
         return states[-1] if states else None
+
+    def _with_next(self, states: list[NavState], frame: FeatureFrame) -> list[NavState]:
+        """States with that at the next frame, or those that supersede all before."""
+        superseded, state = self.replayed, self._take(frame)
+        if self.replayed is not superseded:
+            return list(self.replayed or ())
+        return states if state is None else [*states, state]
 
     def _begin_anew(self, found: FoundCalibration) -> NavState | None:
         """Start again with another calibration, from the frames of the last seconds."""
@@ -344,11 +348,7 @@ class Estimator(EstimatorKnowledge):
             offset_ns = round(self.rig_now.cameras[0].clock_offset_s * 1e9)
             if self._held[0].stamp_ns + offset_ns > self._context.imu.newest_ns() + early_ns:
                 break
-            corrected, state = self.replayed, self._take(self._held.popleft())
-            if self.replayed is not corrected:  # what came before is superseded
-                states = list(self.replayed or ())
-            elif state is not None:
-                states.append(state)
+            states = self._with_next(states, self._held.popleft())
         if self.replayed is not None:
             self.replayed = states
         return states

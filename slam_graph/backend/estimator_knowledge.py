@@ -15,7 +15,7 @@ from slam_graph.backend.backend_config import BackendConfig
 from slam_graph.backend.cost.track_fit import TrackFit
 from slam_graph.backend.cost.zero_velocity import StandstillDetector
 from slam_graph.backend.engine_protocol import Engine, EngineContext, StepReport
-from slam_graph.backend.initialization.clock_change import ClockChanges
+from slam_graph.backend.initialization.clock_change import ClockChange, ClockChanges
 from slam_graph.backend.initialization.segment_joint import SegmentJoint
 from slam_graph.backend.initialization.start_calibration import StartCalibration
 from slam_graph.backend.initialization.start_up import StartUp
@@ -35,6 +35,7 @@ class EstimatorKnowledge:
         window: the variables and what is known of them; None as long as there is no state.
         aiding: takes position fixes and odometry up to the next frame.
         rig: the sensors, as calibrated or corrected at the start.
+        clock_change: found at the last frame: the state is wrong since then; see `begin_segment`.
         clock_changes: those that are corrected in the IMU samples.
         report: what is known of the last step besides the state.
         times_ns: when the states are of the frames that the last call took, by their stamps.
@@ -43,6 +44,7 @@ class EstimatorKnowledge:
     window: Window | None
     aiding: Aiding
     rig: Rig
+    clock_change: ClockChange | None
     clock_changes: ClockChanges
     report: StepReport
     times_ns: dict[int, int]
@@ -134,6 +136,11 @@ class EstimatorKnowledge:
     def imu_noise_at_limit(self) -> bool:
         """Whether a noise density of the IMU was raised as far as it may be."""
         return self._context.propagation.noise.at_limit
+
+    def find_clock_change(self) -> ClockChange | None:
+        """The change of the clock that explains why an estimate is lost, if there is one."""
+        self.clock_change = self.clock_change or self._check.clock_change(self._context.imu)
+        return self.clock_change
 
     @property
     def misses_imu(self) -> bool:

@@ -36,13 +36,13 @@ before so much time has passed since the last time."""
 _MOST_NEW = 0.4
 """Where a larger part of the tracks is new, they are used at once."""
 _LARGE_SHARE, _LARGE_LATER, _OFTEN = 0.3, 0.5, 2
-"""Where something that moves covers such a part of what bodies cover of the image, soon after the
-start and later on, and in so many comparisons in turn, it may be the world as well. Later the world
-is what the estimate has followed so far."""
+"""Where a moving body covers this share of the image area that all bodies cover, in so many
+comparisons in turn, a warning says that it may be what stands still. The first share holds soon
+after the start, the second later, when the world is what the estimate has followed so far."""
 
 
 class RigidMotionWatch:
-    """Finds the tracks that move before the world.
+    """Finds the tracks that do not move with the world.
 
     Args:
         rig: the cameras.
@@ -66,6 +66,7 @@ class RigidMotionWatch:
     def forget(self) -> None:
         """Begin without frames."""
         self.frames: deque[FeatureFrame] = deque()
+        self._last: FeatureFrame | None = None
         self.moving: IntArray = np.zeros(0, np.int64)
         self._since_ns: int | None = None
         self._reviews = 0
@@ -75,8 +76,8 @@ class RigidMotionWatch:
         self._found_first: IntArray = np.zeros(0, np.int64)
 
     def keep(self, frame: FeatureFrame) -> None:
-        """Keep the next frame as long as the start may be made again."""
-        if not self.wanted:
+        """Keep the next frame as long as the start may be made again; not one that is kept."""
+        if not self.wanted or (self.frames and frame.stamp_ns <= self.frames[-1].stamp_ns):
             return
         if self._is_early(frame):
             self.frames.append(frame)
@@ -93,13 +94,10 @@ class RigidMotionWatch:
         self._again_after_ns, self._pending = self.frames[-1].stamp_ns + _PAUSE_NS, False
         return list(self.frames)
 
-    def compare(
-        self, frame: FeatureFrame, state: NavState, motion: FrameMotion | None, sigma_px: float
-    ) -> bool:
-        """Compare a frame with one before.
+    def compare(self, state: NavState, motion: FrameMotion | None, sigma_px: float) -> bool:
+        """Compare the last frame that was used, with all its features, with an earlier one.
 
         Args:
-            frame: all features.
             state: the estimate then.
             motion: of the body within the frame.
             sigma_px: standard deviation of an observation.
@@ -107,6 +105,9 @@ class RigidMotionWatch:
         Returns:
             Whether the estimate is to begin again: something moves since its start.
         """
+        frame = self._last
+        if frame is None:
+            return False
         if self._since_ns is None:
             self._since_ns = frame.stamp_ns
             self._again_after_ns = max(self._again_after_ns, frame.stamp_ns + _WINDOW_NS)
@@ -121,7 +122,7 @@ class RigidMotionWatch:
         if not len(self.moving):
             found, self._found_first = self._confirmed(found), found
         new = found[~is_in(found, self.moving)]
-        kept = self.moving if self.frames else self.moving_of(frame)
+        kept = self.moving if self.frames else self._moving_of(frame)
         self.moving = ascending_union(kept[~is_in(kept, static)], new)
         self._pending |= bool(len(new))
         again = self._reviews < _REVIEWS and frame.stamp_ns >= self._again_after_ns
@@ -132,8 +133,12 @@ class RigidMotionWatch:
         again = np.count_nonzero(is_in(found, self._found_first))
         return found if 2 * again > min(len(found), len(self._found_first)) else found[:0]
 
-    def moving_of(self, frame: FeatureFrame) -> IntArray:
-        """Ids (N,) of the features of a frame that were found to move, ascending."""
+    @property
+    def moving_now(self) -> IntArray:
+        """Ids (N,) of the features of the last frame that were found to move, ascending."""
+        return self.moving[:0] if self._last is None else self._moving_of(self._last)
+
+    def _moving_of(self, frame: FeatureFrame) -> IntArray:
         return self.moving[is_in(self.moving, np.sort(frame.cameras[0].ids))]
 
     def used(self, frame: FeatureFrame) -> FeatureFrame:
@@ -142,7 +147,8 @@ class RigidMotionWatch:
         Those are the moving ones, and beside them all that are too new to have been compared, as
         long as most are not.
         """
-        moving, seen = self.moving_of(frame), frame.cameras[0].ids
+        self._last = frame
+        moving, seen = self._moving_of(frame), frame.cameras[0].ids
         if not len(moving) or self._known is None:
             return frame.without(moving)
         new = ~is_in(seen, self._known)

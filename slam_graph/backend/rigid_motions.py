@@ -1,14 +1,14 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""Which tracks moved as one rigid body between two frames: the world, and what moves before it.
+"""Which tracks moved as one body between two frames: the world, and what moves in front of it.
 
-Two frames that are half a second apart, as the motion from one frame to the next is often within
-the noise: then a pose between that of the world and that of a box fits both. The places of the
-tracks in the first frame are known by a second camera or a depth sensor, with the noise of their
-inverse depths, so that far ones count as well. The motion that most tracks fit is estimated under a
-loss that narrows (graduated non-convexity, with that of Geman & McClure; Yang et al. 2020), and
-then that of the tracks that do not fit it. A second body is one only if its motion explains them
-better, each by so much that chance is ruled out.
+The two frames are some tenths of a second apart, as the motion from one frame to the next is often
+within the noise: then a pose between that of the world and that of a box fits both. The places of
+the tracks in the first frame are known by a second camera or a depth sensor, with the noise of
+their inverse depths, so that far ones count as well. The motion that most tracks fit is estimated
+under a loss that narrows (graduated non-convexity, with that of Geman & McClure; Yang et al. 2020),
+and then that of the tracks that do not fit it. A second body is one only if its motion explains
+them better, each by so much that chance is ruled out.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ of likelihoods of 400, as for the tracks of objects."""
 _FEWEST, _LEAST_SHARE = 8, 0.04
 """Fewer tracks, or a smaller part of all, are no body."""
 _MOST_BODIES = 4
-"""That move before the world."""
+"""Besides the world."""
 _SCALES, _NEARBY = np.array([256.0, 64.0, 16.0, 9.0, 9.0, 9.0]), 2
 """Squared scales of the loss, in squared standard deviations, and the first of them from a motion
 that is nearly right."""
@@ -43,11 +43,12 @@ _NEIGHBOURS, _SEEDS = 12, 6
 _CELLS = 8.0
 """Cells of the image in a focal length, by which the parts that bodies cover are compared: texture
 puts more tracks on one of them."""
-_AMID = 5
-"""So many of the nearest tracks say whether one that is not told moves."""
+_NEAREST_TRACKS = 5
+"""So many of the nearest tracks decide where the residuals of a track do not."""
 _DEPTHS = TriangulationConfig()
 _NEAREST, _FAR = 1e-3, 1e3
-"""Tracks that come nearer to the camera, in depths before, are behind it; residual of these."""
+"""Smallest depth of a track, as a part of its earlier one: below, it counts as behind the camera,
+and has this residual."""
 _DAMPING = 1e-12
 
 
@@ -113,16 +114,16 @@ class RigidMotions:
 
     Attributes:
         ids: (N,) ascending.
-        body: (N,) 0 for the world, k for the k-th body that moves before it, -1 for tracks that fit
+        body: (N,) 0 for the world, k for the k-th body that moves, -1 for tracks that fit
             no motion.
-        clear: (N,) for which the other motions are ruled out.
+        unambiguous: (N,) for which the other motions are ruled out.
         share: of the part of the image that bodies cover, how much is of the largest one that
-            moves; 0 where the body of fewer than half of the tracks is told.
+            moves; 0 where fewer than half of the tracks are unambiguous.
     """
 
     ids: IntArray
     body: IntArray
-    clear: BoolArray
+    unambiguous: BoolArray
     share: float
 
     @property
@@ -133,7 +134,7 @@ class RigidMotions:
     @property
     def static(self) -> IntArray:
         """Ids of the tracks that clearly stand still, ascending."""
-        return np.asarray(self.ids[self.clear & (self.body == 0)])
+        return np.asarray(self.ids[self.unambiguous & (self.body == 0)])
 
 
 def rays_of(
@@ -151,7 +152,7 @@ class _Pairs:
     """Tracks in two frames.
 
     Attributes:
-        before: where they were.
+        before: where they were in the earlier frame.
         rays: (N, 2) where they are seen now.
         sigma: standard deviation of all rays.
     """
@@ -164,7 +165,7 @@ class _Pairs:
         """Residuals under a motion, and how much depth errors spread them.
 
         Args:
-            pose: (3, 4) [R t] of the first camera before, seen from where it is now.
+            pose: (3, 4) [R t] of the first camera at the earlier frame, seen from where it is now.
 
         Returns:
             (N, 2) residuals r, infinite behind the camera, and (N, 2) vectors s. The covariance of
@@ -177,7 +178,7 @@ class _Pairs:
         return r, self.before.inverse_sigma[:, None] * by_inverse
 
     def _seen(self, pose: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Tracks (N, 3) times their inverse depths before, and (N, 2) on the plane z = 1, now."""
+        """Tracks (N, 3) times their earlier inverse depths, and (N, 2) on the plane z = 1, now."""
         x, inverse = self.before.rays, self.before.inverse
         moved = x @ pose[:, :2].T + pose[:, 2] + inverse[:, None] * pose[:, 3]
         return moved, moved[:, :2] / np.maximum(moved[:, 2:], _NEAREST)
@@ -331,8 +332,8 @@ def _sorted(pairs: _Pairs, poses: list[FloatArray], trusted: FloatArray | None) 
     distances = np.array([pairs.distances(pose) for pose in poses])
     nearest, least = distances.argmin(axis=0), distances.min(axis=0)
     second = np.partition(distances, 1, axis=0)[1]
-    told = (least < _FITS) & (second - least > _GAIN)
-    of_body = [told & (nearest == k) for k in range(len(poses))]
+    decided = (least < _FITS) & (second - least > _GAIN)
+    of_body = [decided & (nearest == k) for k in range(len(poses))]
     covers = np.array([_cells(pairs.rays[rows]) for rows in of_body])
     world = int(covers.argmax())
     if trusted is not None:
@@ -340,22 +341,24 @@ def _sorted(pairs: _Pairs, poses: list[FloatArray], trusted: FloatArray | None) 
         usual = [float(np.median(errors[rows])) if rows.any() else np.inf for rows in of_body]
         world = int(np.argmin(usual))
     moves = (least < _FITS) & (distances[world] - least > _GAIN)
-    # what hardly moves against the world, amid tracks that do, is of their body
+    # what hardly moves against the world, among tracks that do, is of their body
     gains = distances[world] - np.delete(distances, world, axis=0).min(axis=0)
-    moves |= (np.abs(gains) <= _GAIN) & _amid(pairs.rays, moves)
+    moves |= (np.abs(gains) <= _GAIN) & _neighbours_move(pairs.rays, moves)
     body = np.where(distances[world] < _FITS, 0, -1)
     place = np.insert(np.arange(1, len(poses)), world, 0)
     of_others = np.delete(distances, world, axis=0).argmin(axis=0)
     of_others += of_others >= world
     share = np.delete(covers, world).max() / max(covers.sum(), 1)
-    share *= 2 * np.count_nonzero(told) >= len(told)
+    share *= 2 * np.count_nonzero(decided) >= len(decided)
     body = np.where(moves, place[of_others], body)
-    return RigidMotions(pairs.before.ids, body, told, float(share))
+    return RigidMotions(pairs.before.ids, body, decided, float(share))
 
 
-def _amid(rays: FloatArray, moves: BoolArray) -> BoolArray:
-    """Which tracks (N,) are amid moving ones: most of those that are nearest in the image."""
-    near = np.sum((rays[:, None] - rays[None]) ** 2, axis=2).argsort(axis=1)[:, 1 : _AMID + 1]
+def _neighbours_move(rays: FloatArray, moves: BoolArray) -> BoolArray:
+    """For which tracks (N,) most of the nearest ones in the image move."""
+    near = np.sum((rays[:, None] - rays[None]) ** 2, axis=2).argsort(axis=1)[
+        :, 1 : _NEAREST_TRACKS + 1
+    ]
     return np.asarray(moves[near].mean(axis=1) > 0.5)
 
 

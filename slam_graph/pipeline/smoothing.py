@@ -27,6 +27,7 @@ _SMOOTHED = (*COMPLETED, "diverged")
 """Run statuses after which the recording is bundle adjusted (not after Ctrl-C)."""
 
 _FAILED = "no smoothed trajectory"
+_SECOND = "no second adjustment, of what fits the causal trajectory"
 _LEAST_LEFT = 0.6
 """Features that do not fit the causal trajectory are left out where this part of the observations
 is left: where less is, it may be what is wrong."""
@@ -151,11 +152,12 @@ class Smoothing(Stage):
             log: all frames.
             first: the adjustment with all features.
         """
-        try:
-            found = self._adjusted(log, consistent=True)
-        except EstimationError as error:
-            logger.info("what fits the causal trajectory has no minimum: %s", error)
-            return None
+        found = None
+        with warn_on_failure(self._diagnostics, "smoothed_contradicts", _SECOND):
+            try:
+                found = self._adjusted(log, consistent=True)
+            except EstimationError as error:
+                logger.info("what fits the causal trajectory has no minimum: %s", error)
         if found is None:
             return None
         left = found.summary.observations / max(first.summary.observations, 1)

@@ -43,6 +43,8 @@ def causal_outliers(log: FrameLog, causal: Trajectory, task: SmoothingTask) -> I
         task: calibration and settings.
     """
     keyframes = log.keyframes
+    if not len(causal):
+        return np.zeros(0, np.int64)
     stamps_ns = log.frames_ns[keyframes] + round(task.rig.pose_offset_s * 1e9)
     covered = (stamps_ns >= causal.stamps_ns[0]) & (stamps_ns <= causal.stamps_ns[-1])
     keyframes = keyframes[covered]
