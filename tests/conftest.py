@@ -6,6 +6,7 @@ import gc
 import logging
 import os
 from collections.abc import Iterator
+from contextlib import nullcontext
 from functools import cache
 from importlib import import_module
 from pathlib import Path
@@ -107,6 +108,15 @@ def rendered() -> Iterator[None]:
 def half(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
     """Files are damaged in half of all ways, the other half is slow."""
     monkeypatch.setattr(damage, "half", request.param)
+
+
+@pytest.fixture(params=["half", slow("full")])
+def share(request: pytest.FixtureRequest) -> Iterator[None]:
+    """Properties are tried with half of their examples, in the slow group with all of them."""
+    from properties import all_examples
+
+    with all_examples(request.function) if request.param == "full" else nullcontext():
+        yield
 
 
 @pytest.fixture

@@ -16,6 +16,7 @@ from typing import Any, TypeVar
 
 import gtsam
 import numpy as np
+import pytest
 from damage import CAMPAIGN
 from hypothesis import HealthCheck, Phase, settings
 from hypothesis import strategies as st
@@ -25,6 +26,9 @@ from slam_graph.errors import SlamGraphError
 from slam_graph.geometry import Trajectory
 
 _Read = TypeVar("_Read")
+_Test = TypeVar("_Test", bound=Callable[..., None])
+_SETTINGS = "_hypothesis_internal_use_settings"
+"""Where Hypothesis keeps the settings of a test until it is run."""
 
 if not CAMPAIGN:
     # Hypothesis also tries numbers and texts of the modules that are loaded, and which these are
@@ -37,10 +41,15 @@ LARGEST_STAMP_NS = 2**62
 """What readers take for a time is nearer to zero."""
 
 
-def examples(in_ci: int = 30) -> settings:
-    """How a property is tried: always the same examples, but for a campaign."""
-    return settings(
-        max_examples=CAMPAIGN or in_ci,
+def examples(full: int = 60) -> Callable[[_Test], _Test]:
+    """How a property is tried: always the same examples, but for a campaign.
+
+    Args:
+        full: how many examples `make slow` tries; `make test` tries half as many. The fixture
+            `share` says which.
+    """
+    tried = settings(
+        max_examples=CAMPAIGN or full // 2,
         derandomize=not CAMPAIGN,
         print_blob=bool(CAMPAIGN),
         phases=[Phase.explicit, Phase.generate, Phase.shrink],
@@ -48,6 +57,22 @@ def examples(in_ci: int = 30) -> settings:
         deadline=None,
         suppress_health_check=list(HealthCheck),
     )
+
+    def property_of(test: _Test) -> _Test:
+        test.full = full  # type: ignore[attr-defined]
+        return pytest.mark.usefixtures("share")(tried(test))
+
+    return property_of
+
+
+@contextmanager
+def all_examples(test: Any) -> Iterator[None]:
+    """A property is tried with all of its examples within the block."""
+    assert hasattr(test, _SETTINGS)
+    with pytest.MonkeyPatch.context() as patch:
+        full = settings(getattr(test, _SETTINGS), max_examples=CAMPAIGN or test.full)
+        patch.setattr(test, _SETTINGS, full)
+        yield
 
 
 def parsed(read: Callable[..., _Read], *arguments: Any) -> _Read | None:

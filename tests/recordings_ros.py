@@ -46,7 +46,9 @@ class BagWriter:
         return self._store.types[name](*values)
 
     def header(self, stamp_ns: int, frame: str) -> Any:
-        stamp = self.make("builtin_interfaces/msg/Time", stamp_ns // 10**9, stamp_ns % 10**9)
+        seconds = stamp_ns // 10**9
+        signed = seconds - 2**32 if seconds >= 2**31 else seconds  # the same bits for rosbags
+        stamp = self.make("builtin_interfaces/msg/Time", signed, stamp_ns % 10**9)
         sequence = (0,) if self._is_ros1 else ()
         return self.make("std_msgs/msg/Header", *sequence, stamp, frame)
 

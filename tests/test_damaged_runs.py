@@ -115,7 +115,7 @@ def wrong(draw: st.DrawFn, rig: Rig) -> Rig:
 
 
 @pytest.mark.parametrize("algorithm", slow_but({"msckf", "swf"}, ALGORITHMS))
-@examples(2)
+@examples(4)
 @given(data=st.data())
 def test_calibrations_of_any_sensors(
     flight: Path, tmp_path_factory: pytest.TempPathFactory, algorithm: str, data: st.DataObject

@@ -1,21 +1,30 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""A result in the folder of another one: files of the other are gone, and nothing else."""
+"""A result in the folder of another one: files of the other make room, and nothing else.
+
+What may be the only copy, a map and a recording for the viewer, is kept under another name.
+"""
 
 import ast
 import os
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
+from types import SimpleNamespace
 
+import numpy as np
 import pytest
 from flight import rig
+from groups import slow
+from interruption import interrupted_at
 
 import slam_graph
 from slam_graph.config import load_config
 from slam_graph.datasets.sequence import SequenceInfo
 from slam_graph.errors import DataError
+from slam_graph.files import Files
 from slam_graph.results import result_files as names
+from slam_graph.results import run_files
 from slam_graph.results.earlier_result import is_file_of_result
 from slam_graph.results.run_input import RunInput
 from slam_graph.results.run_result import RunResult
@@ -51,9 +60,29 @@ def left_of_the_first(folder: Path) -> set[str]:
     return {name for name in OPTIONAL if (folder / name).exists()}
 
 
-def test_no_file_of_another_result_is_left(folder: Path) -> None:
+def with_map(name: str, monkeypatch: pytest.MonkeyPatch) -> RunResult:
+    """A result with a map, in whose file its name is."""
+    result = result_of(name)
+    nowhere = SimpleNamespace(stamps_ns=np.zeros(0, np.int64))
+    known = {"summary": dict, "recordings": [1], "trajectory": lambda _: nowhere, "name": name}
+    result.slam_map = SimpleNamespace(**known)  # type: ignore[assignment]
+
+    def save(made: SimpleNamespace, path: Path, force: bool) -> None:
+        assert force
+        Files.write_text(path, [made.name])
+
+    monkeypatch.setattr(run_files, "save_map", save)
+    return result
+
+
+def test_no_file_of_another_result_is_left(folder: Path, caplog: pytest.LogCaptureFixture) -> None:
     files = result_of("second").save(folder)
     assert not left_of_the_first(folder)
+    for name in ("map-earlier.slam", "recording-earlier.rrd"):
+        assert (folder / name).read_text() == "of the first"
+        assert sum(name in line for line in caplog.messages) == 1
+    assert len(caplog.messages) == 2
+    assert not any("\n" in line for line in caplog.messages)
     assert all((folder / name).read_text() == "of the first" for name in OF_A_USER)
     saved = load_result(folder)
     assert saved.metrics["dataset"]["name"] == "second"
@@ -63,6 +92,46 @@ def test_no_file_of_another_result_is_left(folder: Path) -> None:
     (folder / "objects" / "3.tum").write_text("")
     result_of("third").save(folder)
     assert not (folder / "objects").exists(), "nothing is left in it"
+
+
+def test_a_map_is_lost_only_to_a_map_in_its_place(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """As by a cell of a notebook that is run again and again."""
+    for name in ("first", "second"):
+        with_map(name, monkeypatch).save(tmp_path)
+        assert {path.name: path.read_text() for path in tmp_path.glob("*.slam")} == {
+            "map.slam": name
+        }
+    assert not caplog.messages
+    for _ in range(3):
+        result_of("without").save(tmp_path)
+        with_map("third", monkeypatch).save(tmp_path)
+        result_of("without").save(tmp_path)
+        result_of("without").save(tmp_path)
+    assert {path.name: path.read_text() for path in tmp_path.glob("*.slam")} == {
+        "map-earlier.slam": "second",
+        "map-earlier-2.slam": "third",
+        "map-earlier-3.slam": "third",
+        "map-earlier-4.slam": "third",
+    }
+    assert len(caplog.messages) == 4
+
+
+def test_a_run_that_cannot_write_its_map_keeps_that_of_the_other(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with_map("first", monkeypatch).save(tmp_path)
+    second = with_map("second", monkeypatch)
+
+    def full(*_: object, **__: object) -> None:
+        raise DataError("the disk is full")
+
+    monkeypatch.setattr(run_files, "save_map", full)
+    with pytest.raises(DataError, match="full"):
+        second.save(tmp_path)
+    assert (tmp_path / "map-earlier.slam").read_text() == "first"
+    assert load_result(tmp_path).status == "unfinished"
 
 
 def test_files_that_are_of_no_result_stay(tmp_path: Path) -> None:
@@ -81,6 +150,18 @@ def test_a_later_recording_for_the_viewer_is_of_the_run_that_is_saved(folder: Pa
     assert left_of_the_first(folder) == {"recording.rrd"}
 
 
+@pytest.mark.parametrize("step", [1, slow(15), 23])
+def test_it_is_so_after_an_interruption_too(folder: Path, step: int) -> None:
+    """Whether the second result has its own metrics there by then, or not yet."""
+    later_ns = (folder / names.METRICS).stat().st_mtime_ns + 1
+    os.utime(folder / "recording.rrd", ns=(later_ns, later_ns))
+    second = result_of("second")
+    with interrupted_at(step), pytest.raises(KeyboardInterrupt):
+        second.save(folder)
+    second.save(folder)
+    assert [path.name for path in folder.glob("*.rrd")] == ["recording.rrd"]
+
+
 def test_what_a_run_wrote_on_its_way_is_its_own(folder: Path) -> None:
     result = result_of("second")
     result.save_so_far(folder, 1.0)
@@ -91,41 +172,47 @@ def test_what_a_run_wrote_on_its_way_is_its_own(folder: Path) -> None:
     os.utime(folder / "recording.rrd", ns=(before_ns, before_ns))
     result.save(folder)
     assert (folder / "recording.rrd").read_text() == "of the second"
+    (folder / "run.log").write_text("of the second")
+    (folder / names.MAP_NAME).write_text("of the second")
+    for _ in range(2):
+        result.save(folder)
+        for name in ("recording.rrd", "run.log", names.MAP_NAME):
+            assert (folder / name).read_text() == "of the second"
+    third = result_of("third")
+    third.save(folder)
     result.save(folder)
-    assert not left_of_the_first(folder), "saved again it replaces itself"
+    assert not left_of_the_first(folder), "the third has taken the place of the second meanwhile"
+    assert load_result(folder).metrics["dataset"]["name"] == "second"
 
 
-@pytest.mark.parametrize("step", range(0, 36, 2))
-def test_an_interruption_at_any_file_leaves_no_mixture(
-    folder: Path, monkeypatch: pytest.MonkeyPatch, step: int
-) -> None:
-    """Nothing can be read then, or the second result with its mark."""
-    steps = iter(range(100))
+PLACES = 40
+"""Files that are written, renamed or removed when a result takes the place of the first."""
 
-    def counted(call: object) -> object:
-        def wrapped(*arguments: object, **options: object) -> object:
-            if next(steps) == step:
-                raise KeyboardInterrupt
-            return call(*arguments, **options)  # type: ignore[operator]
 
-        return wrapped
-
-    monkeypatch.setattr(Path, "unlink", counted(Path.unlink))
-    monkeypatch.setattr(os, "replace", counted(os.replace))
-    with suppress(KeyboardInterrupt):
-        result_of("second").save(folder)
-    monkeypatch.undo()
-    try:
+@pytest.mark.parametrize("step", [slow(n) if n % 2 else n for n in range(PLACES)])
+def test_an_interruption_at_any_file_leaves_no_mixture(folder: Path, step: int) -> None:
+    """Nothing can be read then, or one of the results; with its mark if it is not whole."""
+    second = result_of("second")
+    with interrupted_at(step), pytest.raises(KeyboardInterrupt):
+        second.save(folder)
+    for pattern in ("map*.slam", "recording*.rrd"):
+        assert [path.read_text() for path in folder.glob(pattern)] == ["of the first"]
+    with suppress(DataError):
         saved = load_result(folder)
-    except DataError:
-        assert not (folder / names.TRAJECTORY).exists()
+        left, name = left_of_the_first(folder), saved.metrics["dataset"]["name"]
+        assert not left or (name, left) == ("first", set(OPTIONAL))
+        assert saved.status == ("ok" if step == 0 else "unfinished")
         return
-    if left_of_the_first(folder):  # nothing has happened yet
-        assert (saved.metrics["dataset"]["name"], saved.status) == ("first", "ok")
-        assert left_of_the_first(folder) == set(OPTIONAL)
-        return
-    assert saved.metrics["dataset"]["name"] == "second"
-    assert saved.status == "unfinished" or (folder / names.RIG).is_file()
+    assert not (folder / names.TRAJECTORY).exists()
+    second.save(folder)
+    assert not left_of_the_first(folder)
+    assert load_result(folder).status == "ok"
+
+
+def test_no_place_is_left_out(folder: Path) -> None:
+    with interrupted_at(1000) as begun:
+        result_of("second").save(folder)
+    assert len(begun) == PLACES
 
 
 def test_a_corrected_calibration_has_a_file(tmp_path: Path) -> None:

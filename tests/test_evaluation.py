@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Laws of alignment, association, errors and trajectory files."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +16,7 @@ from slam_graph.evaluation.choices import PAIRINGS, DeltaUnit
 from slam_graph.evaluation.relative_pose_error import rpe
 from slam_graph.evaluation.truth_pairing import associate, nearest, synchronize
 from slam_graph.geometry.trajectory import Trajectory, interpolate, seconds_text
-from slam_graph.geometry.trajectory_alignment import Similarity
+from slam_graph.geometry.trajectory_alignment import AlignmentMode, Similarity
 
 MODES = ("yaw", "se3", "sim3")
 
@@ -100,6 +101,55 @@ def test_what_stands_is_not_aligned_by_noise(mode: str, seed: int) -> None:
     with pytest.raises(DataError, match="cannot align"):
         Similarity.of_positions(truth, still, mode)
     Similarity.of_positions(truth, still, mode, doubtful=True)
+
+
+CIRCLES_M, DRIFT_M = 3.0, 30.0
+
+
+def circles_and_what_drifts_away(drift_m: float = DRIFT_M) -> tuple[Trajectory, Trajectory]:
+    """A path over circles, and an estimate of it that drifts along a line on the way."""
+    turns = np.linspace(0.0, 8.0 * np.pi, 400)
+    circles = np.column_stack([np.cos(turns), np.sin(turns), 0.3 * np.sin(2.0 * turns)])
+    stamps_ns = np.arange(400, dtype=np.int64) * 50_000_000
+    truth = Trajectory(stamps_ns, CIRCLES_M * circles, np.tile([0.0, 0.0, 0.0, 1.0], (400, 1)))
+    away = np.linspace(0.0, drift_m, 400)[:, None] * np.array([0.6, -0.8, 0.0])
+    return truth, Trajectory(stamps_ns, truth.positions + away, truth.quaternions)
+
+
+@pytest.mark.parametrize("mode", ["se3", "sim3", "yaw"])
+def test_an_estimate_that_drifts_away_has_an_error(mode: AlignmentMode) -> None:
+    truth, estimate = circles_and_what_drifts_away()
+    error_m = ape(truth, estimate, alignment=mode).statistics.rmse
+    # a scale may shrink all to one place, from where the circles are as far away as they are wide
+    assert error_m > 0.8 * CIRCLES_M
+    if mode != "sim3":
+        assert error_m > 0.2 * DRIFT_M  # that of a line, σ = 1/√12 of it, less what a turn gains
+        further = ape(*circles_and_what_drifts_away(10 * DRIFT_M), alignment=mode)
+        assert further.statistics.rmse > 5.0 * error_m
+
+
+@pytest.mark.parametrize("mode", ["se3", "yaw"])
+def test_an_estimate_that_goes_nowhere_near_the_truth_is_refused_only_if_something_stands(
+    mode: AlignmentMode,
+) -> None:
+    truth, _ = circles_and_what_drifts_away()
+    rng = np.random.default_rng(3)
+    noise = rng.normal(size=(400, 3))
+    stands, apart = (replace(truth, positions=size * noise) for size in (0.01, 1.0))
+    for pair in ((truth, stands), (stands, truth)):
+        with pytest.raises(DataError, match=r"cannot align .* stand"):
+            ape(*pair, alignment=mode)
+    assert ape(truth, apart, alignment=mode).statistics.rmse > 0.8 * CIRCLES_M
+
+
+def test_a_world_that_drifts_away_counts_among_others() -> None:
+    truth, drifted = circles_and_what_drifts_away()
+    middle = int(truth.stamps_ns[200])
+    estimate = Trajectory.concatenate([truth[:200], drifted[200:]])
+    found = ape(truth, estimate, alignment="yaw", breaks_ns=[middle])
+    assert found.poses == len(truth)
+    assert found.statistics.max > 0.2 * DRIFT_M
+    assert found.values[:200].max() < 1e-9
 
 
 @pytest.mark.parametrize("mode", ["se3", "sim3", "yaw"])
@@ -246,6 +296,17 @@ def test_interpolation_keeps_the_poses_and_follows_a_steady_motion() -> None:
     assert turns.magnitude().max() < 1e-12
 
 
+def test_parts_make_the_whole_again_with_the_columns_that_all_have() -> None:
+    whole = random_trajectory(6)
+    parts = [whole[:20], whole[20:20], whole[20:]]
+    joined = Trajectory.concatenate(parts)
+    for name in ("stamps_ns", "positions", "quaternions", "velocities"):
+        np.testing.assert_array_equal(getattr(joined, name), getattr(whole, name))
+    assert joined.gyro_biases is None
+    without = replace(whole[20:], velocities=None)
+    assert Trajectory.concatenate([whole[:20], without]).velocities is None
+
+
 def test_nothing_is_made_up_inside_a_gap() -> None:
     stamps = np.array([0, 10**8, 10**9], dtype=np.int64)
     gappy = Trajectory(stamps, np.zeros((3, 3)), np.tile([0.0, 0.0, 0.0, 1.0], (3, 1)))
@@ -257,11 +318,7 @@ def test_worlds_are_aligned_apart_and_no_step_leads_from_one_to_another() -> Non
     truth = random_trajectory(4)
     parts = [truth[:25], truth[25:26], truth[26:]]
     moved = [random_similarity(k, "sim3").apply(part) for k, part in enumerate(parts)]
-    estimate = Trajectory(
-        truth.stamps_ns,
-        np.concatenate([part.positions for part in moved]),
-        np.concatenate([part.quaternions for part in moved]),
-    )
+    estimate = Trajectory.concatenate(moved)
     breaks = [int(truth.stamps_ns[row]) for row in (25, 26)]
     assert ape(truth, estimate, alignment="sim3").statistics.rmse > 0.1
     found = ape(truth, estimate, alignment="sim3", breaks_ns=breaks)
@@ -271,7 +328,7 @@ def test_worlds_are_aligned_apart_and_no_step_leads_from_one_to_another() -> Non
     steps = rpe(truth, estimate, alignment="sim3", breaks_ns=breaks)
     assert len(steps) == 24 + 33
     assert steps.statistics.max < 1e-9
-    for path, part in zip(found.alignment.undo(truth), (moved[0], moved[2]), strict=True):
+    for path, part in zip(found.alignment.to_estimate(truth), (moved[0], moved[2]), strict=True):
         np.testing.assert_allclose(path, part.positions, atol=1e-9)
     with pytest.raises(DataError, match="cannot align"):
         ape(truth[:2], estimate[:2], alignment="se3", breaks_ns=breaks[:1])

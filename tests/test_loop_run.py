@@ -118,7 +118,10 @@ def assert_reads_back(result: RunResult, saved: SavedRun) -> None:
     assert (saved.slam_map is None) == (result.slam_map is None)
     if saved.slam_map is not None and result.slam_map is not None:
         np.testing.assert_array_equal(saved.slam_map.points, result.slam_map.points)
-    assert len(saved.rig.cameras) == len(result.rig.cameras)
+    for true_rig, rig in ((result.rig, saved.rig), (result.estimated_rig, saved.estimated_rig)):
+        for one, other in zip(true_rig.cameras, rig.cameras, strict=True):
+            assert one.body_T_camera.equals(other.body_T_camera, 1e-6)
+            assert one.time_offset_s == pytest.approx(other.time_offset_s, abs=1e-9)
     np.testing.assert_array_equal(saved.loop_ends_ns, result.loop_ends_ns)
     np.testing.assert_array_equal(saved.keyframes_ns, result.keyframes_ns)
     assert (saved.nees_series is None) == (result.nees_series is None)
@@ -126,7 +129,10 @@ def assert_reads_back(result: RunResult, saved: SavedRun) -> None:
         for true, found in zip(result.nees_series, saved.nees_series, strict=True):
             np.testing.assert_allclose(found, true, rtol=1e-3)
     assert saved.unmeasured == result.unmeasured
+    assert saved.scaled_camera is None
+    assert result.scaled_camera is None
     tested = trajectories | {
+        "scaled_camera",
         "unmeasured",
         "loop_ends_ns",
         "keyframes_ns",
@@ -137,6 +143,7 @@ def assert_reads_back(result: RunResult, saved: SavedRun) -> None:
         "points",
         "slam_map",
         "rig",
+        "estimated_rig",
     }
     for name in ("metrics", "config", "status", "message", "coverage", "start_was_given"):
         assert getattr(saved, name) == getattr(result, name), name

@@ -80,6 +80,7 @@ def test_the_second_half_is_located_in_the_map_of_the_first(
     found = table["localization"]
     assert not table["extent"]["start_was_given"]  # nobody says where the second half begins
     estimated = table["extent"]["estimated_frames"]
+    assert estimated >= 0.8 * table["extent"]["frames"]
     assert found["located"] >= 0.95 * estimated
     assert found["located_share"] >= 0.95 or not whole  # most of the others precede the start
     assert found["first_s"] < 2.5

@@ -170,7 +170,7 @@ def test_aiding(tmp_path_factory: pytest.TempPathFactory, data: st.DataObject) -
     np.testing.assert_allclose(found.fix_covariances, written.fix_covariances, rtol=1e-14)
 
 
-@examples(15)
+@examples(30)
 @given(st.dictionaries(st.integers(-(2**63), 2**63 - 1), trajectories(columns=(7,)), max_size=3))
 def test_true_poses_of_objects(folder: Path, truth: dict[int, Trajectory]) -> None:
     path = folder / "objects_truth.csv"
@@ -234,7 +234,7 @@ def graphs(draw: st.DrawFn, dimension: int, largest: float = 1e17) -> tuple[Pose
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
-@examples(20)
+@examples(40)
 @given(data=st.data())
 def test_g2o(folder: Path, dimension: int, data: st.DataObject) -> None:
     graph, estimates = data.draw(graphs(dimension))
@@ -254,7 +254,7 @@ def test_g2o(folder: Path, dimension: int, data: st.DataObject) -> None:
     )
 
 
-@examples(20)
+@examples(40)
 @given(data=st.data(), with_information=st.booleans())
 def test_toro(folder: Path, data: st.DataObject, with_information: bool) -> None:
     """Information is in the order xx xy yy θθ xθ yθ, or left out."""
@@ -315,7 +315,7 @@ def problems(draw: st.DrawFn, largest: float = 1e17) -> BalProblem:
     return BalProblem(estimates, camera, point, pixels, "problem")
 
 
-@examples(20)
+@examples(40)
 @given(data=st.data(), packed=st.booleans())
 def test_bal(folder: Path, data: st.DataObject, packed: bool) -> None:
     problem = data.draw(problems())
@@ -374,7 +374,7 @@ READERS: dict[str, tuple[Callable[[Path], None], Any]] = {
 
 
 @pytest.mark.parametrize("name", READERS)
-@examples(40)
+@examples(80)
 @given(data=st.data())
 def test_lines_that_are_nearly_right(folder: Path, name: str, data: st.DataObject) -> None:
     check, lines = READERS[name]
@@ -383,7 +383,7 @@ def test_lines_that_are_nearly_right(folder: Path, name: str, data: st.DataObjec
     parsed(check, path)
 
 
-@examples(75)
+@examples(150)
 @given(content=ANYTHING)
 def test_anything(folder: Path, content: bytes) -> None:
     path = folder / "anything.txt"

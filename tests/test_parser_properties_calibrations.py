@@ -51,7 +51,7 @@ pytestmark = [
 # --- calibrations ---------------------------------------------------------------------------------
 
 
-@examples(25)
+@examples(50)
 @given(st.data())
 def test_kalibr(folder: Path, data: st.DataObject) -> None:
     rig, path = data.draw(rigs()), folder / "camchain.yaml"
@@ -60,7 +60,7 @@ def test_kalibr(folder: Path, data: st.DataObject) -> None:
     same_rig(read_kalibr(path), rig, of_kalibr=True)
 
 
-@examples(15)
+@examples(30)
 @given(data=st.data())
 def test_euroc_folders(folder: Path, data: st.DataObject) -> None:
     """Calibration, samples, true trajectory and images are those that were written."""
@@ -179,7 +179,7 @@ IMU_TABLE = {
 }
 
 
-@examples(75)
+@examples(150)
 @given(altered({"cam0": CAMERA_TABLE, "imu0": IMU_TABLE}))
 def test_chains_with_other_values(folder: Path, text: str) -> None:
     path = folder / "altered.yaml"
@@ -189,7 +189,7 @@ def test_chains_with_other_values(folder: Path, text: str) -> None:
         check_rig(rig)
 
 
-@examples(75)
+@examples(150)
 @given(altered({"T_BS": np.eye(4).ravel().tolist(), **CAMERA_TABLE, "rate_hz": 20}))
 def test_sensors_with_other_values(folder: Path, text: str) -> None:
     sensor = folder / "mav0" / "cam0" / "sensor.yaml"
@@ -235,7 +235,7 @@ def settings_like(draw: st.DrawFn) -> dict[str, Any]:
     return found
 
 
-@examples(50)
+@examples(100)
 @given(st.data())
 def test_settings(folder: Path, data: st.DataObject) -> None:
     """What is accepted is written so that it is read again; the rest is refused in one line."""
@@ -249,7 +249,7 @@ def test_settings(folder: Path, data: st.DataObject) -> None:
         assert not isinstance(value, float) or np.isfinite(value)
 
 
-@examples(30)
+@examples()
 @given(st.text(max_size=30), st.text(max_size=30))
 def test_overrides(key: str, value: str) -> None:
     parsed(load_config, None, [f"{key}={value}"])

@@ -52,7 +52,7 @@ def sensors(draw: st.DrawFn, of: int = 1, size: tuple[int, int] | None = None) -
 # --- calibration ----------------------------------------------------------------------------------
 
 
-@examples(25)
+@examples(50)
 @given(data=st.data())
 def test_calibrations(folder: Path, data: st.DataObject) -> None:
     rig = data.draw(rigs(2))
@@ -89,7 +89,7 @@ depth0:
 """
 
 
-@examples(75)
+@examples(150)
 @given(data=st.data())
 def test_edited_calibrations(folder: Path, data: st.DataObject) -> None:
     path = folder / "edited.yaml"
@@ -105,7 +105,7 @@ def test_edited_calibrations(folder: Path, data: st.DataObject) -> None:
 SIZE = (7, 5)
 
 
-@examples(30)
+@examples()
 @given(data=st.data(), sensor=sensors())
 def test_images_of_16_bits(data: st.DataObject, sensor: DepthSensor) -> None:
     """Depths within the range of the sensor, NaN elsewhere."""
@@ -126,7 +126,7 @@ def test_images_of_16_bits(data: st.DataObject, sensor: DepthSensor) -> None:
 NUMBERS = st.floats(width=32) | st.floats(0.0, 20.0, width=32)
 
 
-@examples(30)
+@examples()
 @given(data=st.data(), values=st.lists(NUMBERS, min_size=35, max_size=35))
 def test_images_of_any_floats(data: st.DataObject, values: list[float]) -> None:
     """Also where the depth is registered to another camera, wherever that is."""
@@ -142,7 +142,7 @@ def test_images_of_any_floats(data: st.DataObject, values: list[float]) -> None:
         sound_depth(depth, small, sensor.max_m if sensor.lens is None else np.inf)
 
 
-@examples(50)
+@examples(100)
 @given(content=ANYTHING, data=st.data())
 def test_anything_as_depth(content: bytes, data: st.DataObject) -> None:
     """A file, or a message with its header of two numbers."""
@@ -167,7 +167,7 @@ def test_anything_as_depth(content: bytes, data: st.DataObject) -> None:
 # --- registration ---------------------------------------------------------------------------------
 
 
-@examples(20)
+@examples(40)
 @given(data=st.data())
 def test_registration_to_itself(data: st.DataObject) -> None:
     """A sensor in the place of the camera, with its lens, gives the depths that it has."""
@@ -214,7 +214,7 @@ STAMPS = st.lists(
 )
 
 
-@examples(50)
+@examples(100)
 @given(frames=STAMPS, depths=STAMPS)
 def test_a_depth_image_is_of_one_frame_near_to_it(frames: list[int], depths: list[int]) -> None:
     frames_ns, depths_ns = (np.array(sorted(times), np.int64) for times in (frames, depths))

@@ -69,7 +69,7 @@ def packed(image: np.ndarray, suffix: str) -> bytes:
     return data.tobytes()
 
 
-@examples(30)
+@examples()
 @given(image=pictures(), suffix=st.sampled_from(KINDS))
 def test_images(image: np.ndarray, suffix: str) -> None:
     """To the bit where the format has no loss."""
@@ -80,7 +80,7 @@ def test_images(image: np.ndarray, suffix: str) -> None:
         np.testing.assert_array_equal(found, image)
 
 
-@examples(75)
+@examples(150)
 @given(data=st.data())
 def test_damaged_images(data: st.DataObject) -> None:
     """Some bytes of an image are others, or are missing: an image of bounded size, or a fault."""
@@ -96,7 +96,7 @@ def test_damaged_images(data: st.DataObject) -> None:
 STARTS = [packed(np.zeros((3, 4), np.uint8), suffix) for suffix in KINDS]
 
 
-@examples(50)
+@examples(100)
 @given(start=st.sampled_from(STARTS), kept=st.integers(0, 60), content=ANYTHING)
 def test_anything_as_an_image(start: bytes, kept: int, content: bytes) -> None:
     check_image(start[:kept] + content)
@@ -172,7 +172,7 @@ def times(draw: st.DrawFn, fewest: int = 1) -> np.ndarray:
     return draw(stamps(fewest, 5, 1, end)) * APART_NS - draw(st.integers(0, APART_NS - 1))
 
 
-@examples(30)
+@examples()
 @given(data=st.data())
 def test_tables_of_times(folder: Path, data: st.DataObject) -> None:
     """Nanoseconds, or seconds with a decimal point; with names of files, or without."""
@@ -189,7 +189,7 @@ def test_tables_of_times(folder: Path, data: st.DataObject) -> None:
     assert set(names) == {name.strip(", ").partition(",")[0]}
 
 
-@examples(30)
+@examples()
 @given(data=st.data())
 def test_times_in_names(data: st.DataObject) -> None:
     written, seconds = data.draw(times()), data.draw(st.booleans())
@@ -208,7 +208,7 @@ NAMES = st.text(
 )
 
 
-@examples(30)
+@examples()
 @given(names=st.lists(NAMES | st.from_regex(r"[0-9._+-]{1,25}", fullmatch=True), max_size=5))
 def test_names_of_any_kind(names: list[str]) -> None:
     found = stamps_from_names([Path(f"{name}.png") for name in names])
@@ -245,7 +245,7 @@ def rgbd(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     return write_tum_rgbd(root / "flight", frames=3, size=SIZE), chain
 
 
-@examples(12)
+@examples(25)
 @given(data=st.data())
 def test_folders_of_images(images: Path, data: st.DataObject) -> None:
     """The times of a table belong to the images in the order of their numbers."""
@@ -263,7 +263,7 @@ def test_folders_of_images(images: Path, data: st.DataObject) -> None:
 
 
 @pytest.mark.parametrize("name", ["timestamps.csv", "imu.csv", "calibration.yaml"])
-@examples(20)
+@examples(40)
 @given(data=st.data())
 def test_edited_files_of_a_folder(images: Path, name: str, data: st.DataObject) -> None:
     file = images / name
@@ -273,7 +273,7 @@ def test_edited_files_of_a_folder(images: Path, name: str, data: st.DataObject) 
 
 
 @pytest.mark.parametrize("suffix", [".csv", ".imu.csv", ".yaml"])
-@examples(12)
+@examples(25)
 @given(data=st.data())
 def test_edited_files_beside_a_video(video: Path, suffix: str, data: st.DataObject) -> None:
     file = video.with_suffix(suffix)
@@ -281,7 +281,7 @@ def test_edited_files_beside_a_video(video: Path, suffix: str, data: st.DataObje
         parsed(sound_dataset, video)
 
 
-@examples(12)
+@examples(25)
 @given(data=st.data())
 def test_anything_as_a_video(video: Path, data: st.DataObject) -> None:
     whole = video.read_bytes()
@@ -290,7 +290,7 @@ def test_anything_as_a_video(video: Path, data: st.DataObject) -> None:
         parsed(sound_dataset, video)
 
 
-@examples(12)
+@examples(25)
 @given(data=st.data())
 def test_rgbd(rgbd: tuple[Path, Path], data: st.DataObject) -> None:
     """The images of a list with their times, and depth at the same ones."""
@@ -311,7 +311,7 @@ def test_rgbd(rgbd: tuple[Path, Path], data: st.DataObject) -> None:
 
 
 @pytest.mark.parametrize("name", ["rgb.txt", "depth.txt", "groundtruth.txt"])
-@examples(20)
+@examples(40)
 @given(data=st.data())
 def test_edited_lists(rgbd: tuple[Path, Path], name: str, data: st.DataObject) -> None:
     folder, chain = rgbd

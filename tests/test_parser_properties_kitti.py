@@ -60,7 +60,7 @@ pytestmark = [
 # --- times ----------------------------------------------------------------------------------------
 
 
-@examples(30)
+@examples()
 @given(data=st.data())
 def test_dates(folder: Path, data: st.DataObject) -> None:
     """To the nanosecond, from 1823 to 2116."""
@@ -70,7 +70,7 @@ def test_dates(folder: Path, data: st.DataObject) -> None:
     np.testing.assert_array_equal(read_dates(path), written)
 
 
-@examples(30)
+@examples()
 @given(when=st.datetimes(), fraction=st.from_regex(r"(\.[0-9]{0,12})?", fullmatch=True))
 def test_dates_of_any_year(folder: Path, when: datetime, fraction: str) -> None:
     """Those that do not fit are refused."""
@@ -85,7 +85,7 @@ def test_dates_of_any_year(folder: Path, when: datetime, fraction: str) -> None:
         assert found[0] - int(seconds) * 10**9 == int((fraction[1:10] or "0").ljust(9, "0"))
 
 
-@examples(30)
+@examples()
 @given(data=st.data())
 def test_seconds(folder: Path, data: st.DataObject) -> None:
     end = LARGEST_STAMP_NS // 10**9 * 10**9
@@ -102,7 +102,7 @@ def numbers(values: Any) -> str:
     return " ".join(map(repr, np.ravel(values).tolist()))
 
 
-@examples(30)
+@examples()
 @given(data=st.data())
 def test_poses_of_sensors(folder: Path, data: st.DataObject) -> None:
     pose = data.draw(poses(1e5))
@@ -113,7 +113,7 @@ def test_poses_of_sensors(folder: Path, data: st.DataObject) -> None:
     np.testing.assert_allclose(read_calibration(path).pose().matrix(), pose.matrix(), atol=1e-12)
 
 
-@examples(30)
+@examples()
 @given(
     focal=st.floats(1.0, 1e5), centre=vectors(2, 1e5), shift=vectors(3, 1e5), size=st.integers(1, 9)
 )
@@ -142,7 +142,7 @@ LATITUDE_DEG = 85.0
 """Mercator's coordinates go to infinity at the poles."""
 
 
-@examples(15)
+@examples(30)
 @given(data=st.data())
 def test_navigation_units(drive: Path, folder: Path, data: st.DataObject) -> None:
     """Rates, specific forces, velocities and turns are those in the files, to the bit."""
@@ -189,7 +189,7 @@ def named(drive: Path, name: str) -> Path:
 
 
 @pytest.mark.parametrize("name", RAW)
-@examples(20)
+@examples(40)
 @given(data=st.data())
 def test_edited_files_of_a_drive(drive: Path, name: str, data: st.DataObject) -> None:
     file = named(drive, name)
@@ -198,7 +198,7 @@ def test_edited_files_of_a_drive(drive: Path, name: str, data: st.DataObject) ->
 
 
 @pytest.mark.parametrize("number", range(0, 30, 3))
-@examples(8)
+@examples(16)
 @given(data=st.data())
 def test_any_numbers_of_a_navigation_unit(drive: Path, number: int, data: st.DataObject) -> None:
     """Finite ones of any size: each sample is read, or left out."""
@@ -219,7 +219,7 @@ def extract(drive: Path) -> Path:
     return copied
 
 
-@examples(15)
+@examples(30)
 @given(data=st.data())
 def test_edited_calibrations_of_images_to_be_rectified(extract: Path, data: st.DataObject) -> None:
     file = named(extract, "calib_cam_to_cam.txt")
@@ -248,7 +248,7 @@ def sequence(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_kitti_odometry(tmp_path_factory.mktemp("odometry"), frames=3)
 
 
-@examples(20)
+@examples(40)
 @given(data=st.data())
 def test_poses(sequence: Path, data: st.DataObject) -> None:
     """Those of camera 0 in its first frame, in axes x forward, y left, z up."""
@@ -272,7 +272,7 @@ ODOMETRY = {"calib.txt": 13, "times.txt": 1, "../../poses/03.txt": 12}
 
 
 @pytest.mark.parametrize("name", ODOMETRY)
-@examples(30)
+@examples()
 @given(data=st.data())
 def test_edited_files_of_a_sequence(sequence: Path, name: str, data: st.DataObject) -> None:
     file = sequence / name
@@ -281,7 +281,7 @@ def test_edited_files_of_a_sequence(sequence: Path, name: str, data: st.DataObje
         parsed(sound_dataset, sequence)
 
 
-@examples(30)
+@examples()
 @given(largest=st.floats(1.0, 1.7e308), data=st.data())
 def test_places_of_any_size(sequence: Path, largest: float, data: st.DataObject) -> None:
     """Poses that are too far for any measurement are left out."""

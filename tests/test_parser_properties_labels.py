@@ -66,7 +66,7 @@ def empty(folder: Path) -> Path:
 # --- label images ---------------------------------------------------------------------------------
 
 
-@examples(20)
+@examples(40)
 @given(data=st.data(), wide=st.booleans(), seconds=st.booleans())
 def test_label_images(folder: Path, data: st.DataObject, wide: bool, seconds: bool) -> None:
     """Of 8 or 16 bits, named by their times in ns or in s, and found at these."""
@@ -88,7 +88,7 @@ def test_label_images(folder: Path, data: st.DataObject, wide: bool, seconds: bo
         assert found.image(stamp + 2_000_000, SIZE) is None
 
 
-@examples(30)
+@examples()
 @given(
     stamp=st.integers(-LARGEST_STAMP_NS, LARGEST_STAMP_NS),
     name=st.from_regex(r"[0-9]{0,22}(\.[0-9]{0,11})?", fullmatch=True)
@@ -104,7 +104,7 @@ def test_any_name_and_content_of_a_label_image(
     assert found is None or found.shape == SIZE[::-1]
 
 
-@examples(30)
+@examples()
 @given(
     label=LABELS,
     pixels=st.lists(st.tuples(finite(1e17), finite(1e17)), max_size=6),
@@ -130,7 +130,7 @@ def boxes(draw: st.DrawFn) -> tuple[int, int, list[float]]:
     return draw(st.integers(1, 3)) * 10**8, draw(LABELS), [left, top, right, bottom]
 
 
-@examples(30)
+@examples()
 @given(data=st.data(), drawn=st.lists(boxes(), min_size=1, max_size=5))
 def test_boxes(
     folder: Path, data: st.DataObject, drawn: list[tuple[int, int, list[float]]]
@@ -155,7 +155,7 @@ BOXES = (
 )
 
 
-@examples(50)
+@examples(100)
 @given(
     data=st.data(), stamp=st.sampled_from([10**8, 2 * 10**8, 0]) | st.integers(-(2**63), 2**63 - 1)
 )
@@ -193,7 +193,7 @@ CLASS_NAMES = st.text(
 ).filter(lambda name: name == " ".join(name.split()))
 
 
-@examples(30)
+@examples()
 @given(
     data=st.data(), classes=st.dictionaries(st.integers(0, LARGEST_LABEL), CLASS_NAMES, max_size=4)
 )
@@ -209,7 +209,7 @@ def test_a_class_of_no_label_is_refused(tmp_path: Path) -> None:
         read_classes(tmp_path)
 
 
-@examples(50)
+@examples(100)
 @given(content=ANYTHING | edited("7,car\n3,person on a bike\n# a,b\n\n300,bus\n"))
 def test_edited_classes(folder: Path, content: bytes) -> None:
     (folder / "classes.csv").write_bytes(content)
@@ -239,7 +239,7 @@ def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.parametrize("name", ["labels.bin", "moving.bin", "moving_frames.bin"])
-@examples(20)
+@examples(40)
 @given(data=st.data())
 def test_labels_of_other_numbers(flight: Path, name: str, data: st.DataObject) -> None:
     """Files of the right length, with some words of four bytes that are any."""
@@ -256,7 +256,7 @@ def test_labels_of_other_numbers(flight: Path, name: str, data: st.DataObject) -
 # --- true poses of objects ------------------------------------------------------------------------
 
 
-@examples(40)
+@examples(80)
 @given(data=st.data())
 def test_edited_true_poses(folder: Path, data: st.DataObject) -> None:
     truth = {number: data.draw(trajectories(1e6, (7,))) for number in (1, 2)}

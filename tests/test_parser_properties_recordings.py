@@ -73,7 +73,7 @@ def observations(draw: st.DrawFn, width: int) -> FeatureObservations:
     return FeatureObservations(np.array(ids, np.int64), pixels, normalized, descriptors=descriptors)
 
 
-@examples(12)
+@examples(25)
 @given(data=st.data(), name=NAMES, width=st.sampled_from([0, 1, 32]))
 def test_recordings(folder: Path, data: st.DataObject, name: str, width: int) -> None:
     rig, truth = data.draw(rigs(2)), data.draw(trajectories())
@@ -128,7 +128,7 @@ def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.parametrize("name", ["frames.bin", "features.bin", "imu.bin"])
-@examples(12)
+@examples(25)
 @given(data=st.data())
 def test_recordings_of_other_numbers(flight: Path, name: str, data: st.DataObject) -> None:
     """Files of the right length, with some rows or all of any eight bytes."""
@@ -179,7 +179,7 @@ def maps(draw: st.DrawFn) -> SlamMap:
     )
 
 
-@examples(12)
+@examples(25)
 @given(content=maps())
 def test_maps(folder: Path, content: SlamMap) -> None:
     path = folder / "a.slam"
@@ -196,7 +196,7 @@ def test_maps(folder: Path, content: SlamMap) -> None:
         np.testing.assert_allclose(array, wanted[name], rtol=0.0, atol=1e-14 if rounded else 0.0)
 
 
-@examples(30)
+@examples()
 @given(data=st.data(), name=st.sampled_from(sorted(arrays_of(WALL))))
 def test_maps_of_other_numbers(folder: Path, data: st.DataObject, name: str) -> None:
     """Some values of an array are any of its type."""
@@ -218,7 +218,7 @@ def test_maps_of_other_numbers(folder: Path, data: st.DataObject, name: str) -> 
 
 
 @pytest.mark.parametrize("kind", ["ros1", "mcap", "sqlite"])
-@examples(8)
+@examples(16)
 @given(data=st.data())
 def test_bags(folder: Path, kind: str, data: st.DataObject) -> None:
     """Samples and images of any time that ROS can write: seconds of 31 bits, or of 32."""
@@ -276,7 +276,7 @@ READERS: dict[str, Callable[[Path], Any]] = {
 
 
 @pytest.mark.parametrize("name", READERS)
-@examples(30)
+@examples()
 @given(content=ANYTHING, begins=st.booleans(), ends=st.booleans())
 def test_anything(folder: Path, name: str, content: bytes, begins: bool, ends: bool) -> None:
     """Also after the bytes that files of the kind begin with, and before those at the end."""

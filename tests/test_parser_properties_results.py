@@ -76,7 +76,7 @@ def histories(draw: st.DrawFn) -> StateHistory:
     return history
 
 
-@examples(30)
+@examples()
 @given(history=histories())
 def test_states(folder: Path, history: StateHistory) -> None:
     """Nine digits of velocities, biases and standard deviations; NaN where these are not known."""
@@ -91,7 +91,7 @@ def test_states(folder: Path, history: StateHistory) -> None:
     np.testing.assert_allclose(found, wanted, rtol=1e-8, atol=1e-300)
 
 
-@examples(30)
+@examples()
 @given(points=st.lists(vectors(3, 1e18), max_size=6), red=st.booleans())
 def test_points(folder: Path, points: list[list[float]], red: bool) -> None:
     """To the bit; of a cloud with cameras nothing is read as points."""
@@ -103,7 +103,7 @@ def test_points(folder: Path, points: list[list[float]], red: bool) -> None:
         np.testing.assert_array_equal(found, written)
 
 
-@examples(30)
+@examples()
 @given(
     rows=st.lists(
         st.tuples(st.integers(1 - 2**62, 2**62 - 1), finite(1e17) | st.just(np.nan)),
@@ -180,7 +180,7 @@ TEXTS = (
 
 
 @pytest.mark.parametrize("name", TEXTS)
-@examples(20)
+@examples(40)
 @given(data=st.data())
 def test_edited_files_of_a_run(saved: Path, name: str, data: st.DataObject) -> None:
     file = saved / name
@@ -193,7 +193,7 @@ def test_edited_files_of_a_run(saved: Path, name: str, data: st.DataObject) -> N
         parsed(check_run, saved)
 
 
-@examples(30)
+@examples()
 @given(data=st.data())
 def test_any_points(saved: Path, data: st.DataObject) -> None:
     whole = bytearray((saved / "map.ply").read_bytes())
@@ -234,7 +234,7 @@ def altered(draw: st.DrawFn, table: dict[str, Any]) -> bytes:
     return json.dumps(table).encode()
 
 
-@examples(75)
+@examples(150)
 @given(data=st.data())
 def test_metrics_with_other_values(saved: Path, data: st.DataObject) -> None:
     file = saved / "metrics.json"
@@ -252,7 +252,7 @@ class Done:
         return read_result(self.result) is not None
 
 
-@examples(50)
+@examples(100)
 @given(data=st.data())
 def test_a_comparison_with_other_values(
     result: sg.RunResult, folder: Path, data: st.DataObject
@@ -266,7 +266,7 @@ def test_a_comparison_with_other_values(
     assert all(isinstance(cell, str) for cell in cells)
 
 
-@examples(50)
+@examples(100)
 @given(data=st.data())
 def test_marks_of_a_batch_with_other_values(saved: Path, data: st.DataObject) -> None:
     file = saved / MARK
@@ -275,7 +275,7 @@ def test_marks_of_a_batch_with_other_values(saved: Path, data: st.DataObject) ->
     assert mark is None or isinstance(mark, dict)
 
 
-@examples(30)
+@examples()
 @given(path=trajectories(columns=(7,), least=1 - 2**61, end=2**61), content=ANYTHING)
 def test_trajectories_of_results(folder: Path, path: Any, content: bytes) -> None:
     """An empty file is a trajectory without poses."""

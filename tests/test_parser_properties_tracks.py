@@ -113,7 +113,7 @@ SIGMAS = ("q", "p", "v", "ba", "bg")
 """Standard deviations of a start, in the order of the covariance."""
 
 
-@examples(12)
+@examples(25)
 @given(data=st.data())
 def test_openvins(openvins: Path, data: st.DataObject) -> None:
     """Tracks, samples, true states, and the start with its standard deviations."""
@@ -175,7 +175,7 @@ def calibration_of(rig: Rig) -> str:
     return json.dumps({"imu": noise, "cam_imu_time_offset_s": offset_s, "cameras": cameras})
 
 
-@examples(20)
+@examples(40)
 @given(data=st.data())
 def test_calibrations_of_openvins(openvins: Path, data: st.DataObject) -> None:
     """Each camera, its place and clock, and the noise of the IMU."""
@@ -196,7 +196,7 @@ OPENVINS = ("calib.yaml", "tracks.csv", "imu.csv", "groundtruth.csv", "init_stat
 
 
 @pytest.mark.parametrize("name", OPENVINS)
-@examples(30)
+@examples()
 @given(data=st.data())
 def test_edited_files_of_openvins(
     tmp_path_factory: pytest.TempPathFactory, name: str, data: st.DataObject
@@ -214,7 +214,7 @@ COLUMNS = {"tracks.csv": 5, "imu.csv": 7, "groundtruth.csv": 17, "init_state.csv
 
 
 @pytest.mark.parametrize("name", COLUMNS)
-@examples(15)
+@examples(30)
 @given(data=st.data())
 def test_any_rows_of_openvins(openvins: Path, name: str, data: st.DataObject) -> None:
     rows = rows_as_bytes(",", COLUMNS[name])
@@ -249,7 +249,7 @@ def eqvio_text(
     return "\n".join(lines)
 
 
-@examples(20)
+@examples(40)
 @given(data=st.data())
 def test_eqvio(folder: Path, data: st.DataObject) -> None:
     """Times are whole microseconds."""
@@ -282,7 +282,7 @@ def eqvio() -> str:
     return "".join(lengths)
 
 
-@examples(50)
+@examples(100)
 @given(data=st.data())
 def test_edited_rows_of_eqvio(folder: Path, eqvio: str, data: st.DataObject) -> None:
     path = folder / "edited.csv"
@@ -296,7 +296,7 @@ def test_edited_rows_of_eqvio(folder: Path, eqvio: str, data: st.DataObject) -> 
 TAGS = ("vision_feature,", "imu,", "meta,")
 
 
-@examples(30)
+@examples()
 @given(content=rows_of(",", 19, TAGS))
 def test_any_rows_of_eqvio(folder: Path, eqvio: str, content: str) -> None:
     path = folder / "rows.csv"

@@ -232,6 +232,52 @@ def test_an_edge_between_two_sessions_is_no_odometry(ids: int) -> None:
     assert distance(solution.poses, optimize_pose_graph(graph).poses) < 0.1
 
 
+@pytest.mark.parametrize("unit", [7, 100_000_000])
+def test_odometry_is_the_same_whatever_ids_count(unit: int) -> None:
+    """Poses that are missing are no gap, ten usual steps are the most; one rule for all units."""
+    graph, _ = laps(2)
+    steps = np.ones(59, np.int64)
+    steps[[5, 17, 40, 50]] = 2, 10, 11, 1000
+    keys = np.concatenate([[0], np.cumsum(steps)])
+    counted = replace(graph, keys=keys).is_odometry
+    assert np.flatnonzero(~counted[:59]).tolist() == [40, 50]
+    assert not counted[59:].any()
+    assert np.array_equal(replace(graph, keys=unit * keys - 3).is_odometry, counted)
+
+
+def test_the_only_edge_between_two_sessions_is_trusted() -> None:
+    """Until another one joins them, too."""
+    graph, _ = laps(2, 0.02)
+    keys = np.arange(60)
+    keys[30:] += 500
+    crosses = (graph.edges < 30).any(axis=1) & (graph.edges >= 30).any(axis=1)
+    crosses[29] = False
+    sessions = replace(graph, keys=keys).keep_edges(~crosses)
+    assert np.flatnonzero(sessions.is_odometry).tolist() == list(range(59))
+    joined = replace(graph, keys=keys).keep_edges(~crosses | (graph.edges == [10, 30]).all(axis=1))
+    assert len(joined.edges) == len(sessions.edges) + 1
+    assert np.flatnonzero(~joined.is_odometry[:59]).tolist() == [29]
+    twice = np.concatenate([np.arange(len(sessions.edges)), [29]])
+    assert not sessions.keep_edges(twice).is_odometry[[29, -1]].any(), "two may contradict"
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_an_edge_across_a_gap_is_odometry_if_it_alone_joins_two_parts(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    count, edges = int(rng.integers(4, 15)), rng.integers(0, 15, (int(rng.integers(3, 22)), 2))
+    edges = edges[(edges < count).all(axis=1) & (edges[:, 0] != edges[:, 1])]
+    keys = np.arange(count)
+    keys[count // 2 :] += 10 * count
+    measured = Poses.identity(len(edges), 2)
+    information = np.tile(np.eye(3), (len(edges), 1, 1))
+    graph = PoseGraph(keys, None, edges, measured, information)
+    for row, ends in enumerate(np.sort(edges, axis=1).tolist()):
+        without = graph.keep_edges(np.arange(len(edges)) != row)
+        alone = len(without.anchors) > len(graph.anchors)
+        across = ends == [count // 2 - 1, count // 2]
+        assert graph.is_odometry[row] == (ends[1] - ends[0] == 1 and (alone or not across))
+
+
 def test_consecutive_poses_need_not_have_consecutive_ids() -> None:
     """They may be times, of which a few are missing."""
     graph, _ = laps(2, 0.02)

@@ -204,6 +204,8 @@ def _located(table: _Table) -> str:
 
 def _consistency(nees: _Table, title: str = "NEES") -> Iterator[tuple[str, ...]]:
     """Mean NEES beside its ideal."""
+    if nees["left_out"]:
+        title += f" (without {nees['left_out']} states whose place is not known)"
     yield title, "mean", "ideal", "inside 95% bounds"
     for name in ("orientation", "position", "pose"):
         row = nees[name]

@@ -30,7 +30,7 @@ from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.display import Displayed
 from slam_graph.evaluation.choices import ERROR_UNITS, Pairing, PoseRelation, require_known
 from slam_graph.evaluation.truth_pairing import synchronize
-from slam_graph.evaluation.worlds_apart import WorldAlignment
+from slam_graph.evaluation.worlds_apart import PiecewiseAlignment
 from slam_graph.geometry import AlignmentMode, Similarity, Trajectory
 
 
@@ -88,7 +88,7 @@ class ErrorSeries(Displayed):
     stamps_ns: NDArray[np.int64]
     values: NDArray[np.float64]
     statistics: Statistics
-    alignment: WorldAlignment
+    alignment: PiecewiseAlignment
     poses: int
     unit: str = ""
     step_unit: str = ""
@@ -182,7 +182,7 @@ def aligned_pair(
     pairing: Pairing,
     limit_s: float | None,
     breaks_ns: Sequence[int] | IntArray = (),
-) -> tuple[Trajectory, Trajectory, WorldAlignment]:
+) -> tuple[Trajectory, Trajectory, PiecewiseAlignment]:
     """The truth and the estimate pose by pose, the estimate aligned, and the maps that did so.
 
     Raises:
@@ -191,7 +191,7 @@ def aligned_pair(
     """
     require_known(alignment, get_args(AlignmentMode), "alignment")
     truth, guess = synchronize(reference, estimate, pairing, limit_s)
-    worlds = WorldAlignment.fitted(truth, guess, alignment, breaks_ns)
+    worlds = PiecewiseAlignment.fitted(truth, guess, alignment, breaks_ns)
     return truth.select(worlds.known(guess.stamps_ns)), worlds.apply(guess), worlds
 
 

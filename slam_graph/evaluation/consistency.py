@@ -43,6 +43,7 @@ class Nees:
         pose: (N,) with 6.
         covariances: (N, 6, 6) of these poses, rotation before position, body frame.
         similarity: the map from the world of the estimate to that of the truth that was applied.
+        left_out: number of states of worlds whose place is not known, which have no NEES.
     """
 
     stamps_ns: NDArray[np.int64]
@@ -51,12 +52,16 @@ class Nees:
     pose: FloatArray
     covariances: FloatArray
     similarity: Similarity
+    left_out: int = 0
 
     @staticmethod
-    def joined(parts: Sequence[Nees]) -> Nees:
-        """That of W ≥ 1 worlds, in the order of time, with the map of the first."""
-        if len(parts) == 1:
-            return parts[0]
+    def joined(parts: Sequence[Nees], left_out: int = 0) -> Nees:
+        """That of W ≥ 1 worlds, in the order of time, with the map of the first.
+
+        Args:
+            parts: of the worlds.
+            left_out: number of states of further worlds.
+        """
 
         def column(name: str) -> NDArray[Any]:
             return np.concatenate([getattr(part, name) for part in parts])
@@ -68,6 +73,7 @@ class Nees:
             pose=column("pose"),
             covariances=column("covariances"),
             similarity=parts[0].similarity,
+            left_out=left_out,
         )
 
     def series(self) -> dict[str, tuple[FloatArray, int]]:

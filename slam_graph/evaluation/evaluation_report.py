@@ -22,6 +22,7 @@ from slam_graph.evaluation.consistency import CONFIDENCE, Nees, mean_bounds, nee
 from slam_graph.evaluation.relative_pose_error import rpe
 from slam_graph.evaluation.truth_pairing import synchronize
 from slam_graph.evaluation.unknown_scale import mounted_covariances, scale_of_covariances
+from slam_graph.evaluation.worlds_apart import PiecewiseAlignment
 from slam_graph.geometry import (
     AlignmentMode,
     Similarity,
@@ -36,9 +37,6 @@ _REPORTED_ALIGNMENTS: tuple[AlignmentMode, ...] = ("none", "yaw", "se3", "sim3")
 
 _RPE_DELTA_M = 1.0
 """Relative errors are taken over all pairs of poses about one metre of path apart."""
-
-_UNPLACED_M = 100.0
-"""σ of a position beyond which nothing is known of it."""
 
 _NO_SCALE = "the scale is unknown: see sim3"
 
@@ -98,7 +96,11 @@ def consistency_report(
     result, alignment = nees_of_run(truth, history, aligned, smoothed, breaks_ns)
     if len(result.stamps_ns) == 0:
         return None
-    table: Table = {"alignment": alignment, "states": len(result.pose)}
+    table: Table = {
+        "alignment": alignment,
+        "states": len(result.pose),
+        "left_out": result.left_out,
+    }
     for name, (values, dof) in result.series().items():
         low, high = mean_bounds(dof, 1)
         table[name] = {
@@ -176,13 +178,18 @@ def nees_of_run(
         aligned: whether the estimate lives in the world of the truth already.
         smoothed: the smoothed trajectory of the run, if there is one.
         breaks_ns: increasing times at which the estimate goes on in another world. Each world is
-            aligned by its first pose then, to which its covariances are relative. A causal world
-            whose place is not known has none, and is left out.
+            aligned by the pose to which its covariances are relative: causal ones by the first,
+            smoothed ones by that whose position is known best. Causal covariances of a world whose
+            place is not known are relative to none of its poses: its states are left out, and
+            counted.
 
     Raises:
         DataError: if truth and estimate share no time.
     """
     estimate, covariances = history.trajectory(), history.pose_covariances()
+    within = smoothed.within if smoothed is not None and history is smoothed.history else None
+    if within is not None:
+        covariances = within
     if history.scaled_camera is not None:
         covariances = mounted_covariances(covariances, history.scaled_camera)
         truth, estimate = (path.mounted(history.scaled_camera) for path in (truth, estimate))
@@ -194,30 +201,36 @@ def nees_of_run(
             found = aligned_by_smoothed(truth, history, smoothed)
             if found is not None:
                 return nees(estimate, found[1], truth, found[0]), "yaw"
-    parts, failures = [], []
+    parts, failures, left_out = [], [], 0
     world = np.searchsorted(breaks_ns, estimate.stamps_ns, "right")
     for number in range(len(breaks_ns) + 1):
         rows = np.flatnonzero(world == number)
         part, known = estimate.select(rows), covariances[rows]
-        if number and len(rows) and _is_unplaced(known[0]):
+        if number and len(rows) and not _is_placed(known[0]):
+            left_out += len(rows)
             continue
         try:
-            given = aligned and number == 0
-            onto = None if given else _by_first_pose(truth, part, known, history)
+            given, first = aligned and number == 0, 0
+            if within is not None and len(rows):
+                spreads = np.trace(known[:, 3:, 3:], axis1=1, axis2=2)
+                first = int(np.argmin(np.nan_to_num(spreads, nan=np.inf)))
+            own = part[first:], known[first:]
+            onto = None if given else _by_first_pose(truth, *own, history)
             parts.append(nees(part, known, truth, onto))
         except DataError as error:
             failures.append(error)
     if not parts:
         raise failures[0]
-    return Nees.joined(parts), "first_pose" if history.has_scale else "first_pose_and_scale"
+    how: _NeesAlignment = "first_pose" if history.has_scale else "first_pose_and_scale"
+    return Nees.joined(parts, left_out), how
 
 
-def _is_unplaced(covariance: FloatArray) -> bool:
-    """Whether a covariance (6, 6) of the first pose of a world says that its place is not known.
+def _is_placed(covariance: FloatArray) -> bool:
+    """Whether a covariance (6, 6) of the first pose of a world says that its place is known.
 
-    Then those of later ones say the same, and nothing of what has been estimated since.
+    If not those of later ones say the same, and nothing of what has been estimated since.
     """
-    return bool(np.trace(covariance[3:, 3:]) > _UNPLACED_M**2)
+    return bool(PiecewiseAlignment.placed(np.diag(covariance)[None, 3:])[0])
 
 
 def _by_first_pose(

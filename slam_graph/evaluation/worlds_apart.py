@@ -4,7 +4,8 @@
 
 A run that was lost goes on in another world where nothing measured the way in between. One
 alignment over all would say how far the worlds happen to be from one another, and nothing of the
-estimate.
+estimate. After loop closure a world may be gone back to, after another one in between: each stay in
+it is aligned by itself then, so that an error of the one relative to the other does not count.
 """
 
 from __future__ import annotations
@@ -18,9 +19,12 @@ from slam_graph.arrays import BoolArray, FloatArray, IntArray
 from slam_graph.errors import DataError
 from slam_graph.geometry import AlignmentMode, Similarity, Trajectory
 
+_UNPLACED_M = 100.0
+"""σ of a position beyond which nothing is known of it."""
+
 
 @dataclass(frozen=True, eq=False)
-class WorldAlignment:
+class PiecewiseAlignment:
     """The maps from the worlds of an estimate to that of a reference.
 
     Attributes:
@@ -37,7 +41,7 @@ class WorldAlignment:
         estimate: Trajectory,
         mode: AlignmentMode,
         breaks_ns: Sequence[int] | IntArray = (),
-    ) -> WorldAlignment:
+    ) -> PiecewiseAlignment:
         """The alignment of poses at the same times.
 
         Args:
@@ -65,7 +69,7 @@ class WorldAlignment:
                 failures.append(error)
         if all(similarity is None for similarity in found):
             raise failures[0]
-        return WorldAlignment(tuple(found), breaks)
+        return PiecewiseAlignment(tuple(found), breaks)
 
     @property
     def first(self) -> Similarity:
@@ -99,9 +103,9 @@ class WorldAlignment:
             for similarity, part in zip(self.similarities, self._parts(estimate), strict=True)
             if similarity is not None
         ]
-        return parts[0] if len(parts) == 1 else _joined(parts)
+        return parts[0] if len(parts) == 1 else Trajectory.concatenate(parts)
 
-    def undo(self, reference: Trajectory) -> list[FloatArray]:
+    def to_estimate(self, reference: Trajectory) -> list[FloatArray]:
         """(M, 3) positions of the reference in each world that is aligned."""
         return [
             (part.positions - to.translation) @ to.rotation / to.scale
@@ -109,18 +113,16 @@ class WorldAlignment:
             if to is not None
         ]
 
+    @staticmethod
+    def placed(variances: FloatArray) -> BoolArray:
+        """(N,) whether positions with variances (N, 3), m², have a place in the first world.
+
+        Those of a world that nothing joins to it have none. Where variances are not known they are
+        not known to have none.
+        """
+        return np.asarray(~(variances.sum(axis=1) > _UNPLACED_M**2))
+
     def _parts(self, trajectory: Trajectory) -> list[Trajectory]:
         """The poses in each of the worlds."""
         world = self.world_of(trajectory.stamps_ns)
         return [trajectory.select(world == k) for k in range(len(self.similarities))]
-
-
-def _joined(parts: list[Trajectory]) -> Trajectory:
-    """Trajectories that follow one another, as one; with what all of them have."""
-    columns = ("positions", "quaternions", "velocities", "accel_biases", "gyro_biases")
-    whole = {
-        name: np.concatenate([getattr(part, name) for part in parts])
-        for name in columns
-        if all(getattr(part, name) is not None for part in parts)
-    }
-    return Trajectory(np.concatenate([part.stamps_ns for part in parts]), **whole)

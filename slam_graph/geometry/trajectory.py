@@ -11,7 +11,7 @@ Interpolation of trajectories: positions linearly, orientations by slerp.
 from __future__ import annotations
 
 import importlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar, Literal, overload
@@ -154,6 +154,20 @@ class Trajectory(Displayed):
             f"no pose at {seconds_text(stamp_ns)} s: the trajectory is {span}, and gaps of more "
             f"than {max_gap_s:g} s are not bridged"
         )
+
+    @staticmethod
+    def concatenate(parts: Sequence[Trajectory]) -> Trajectory:
+        """Trajectories that follow one another, at least one, with the columns that all have."""
+        optional = {
+            name: np.concatenate(columns)
+            for name in ("velocities", "accel_biases", "gyro_biases")
+            for columns in ([getattr(part, name) for part in parts],)
+            if all(values is not None for values in columns)
+        }
+        stamps_ns = np.concatenate([part.stamps_ns for part in parts])
+        positions = np.concatenate([part.positions for part in parts])
+        quaternions = np.concatenate([part.quaternions for part in parts])
+        return Trajectory(stamps_ns, positions, quaternions, **optional)
 
     def select(self, rows: slice | IntArray | BoolArray) -> Trajectory:
         """Some of the poses, with all that belongs to them."""

@@ -9,6 +9,7 @@ single camera alone (`sim3`).
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal, get_args
 
@@ -22,12 +23,14 @@ from slam_graph.geometry.trajectory import Trajectory
 AlignmentMode = Literal["none", "yaw", "se3", "sim3", "scale"]
 ALIGNMENT_MODES: tuple[AlignmentMode, ...] = get_args(AlignmentMode)
 
-_LEAST_CORRELATION = 0.5
-"""Positions determine an alignment where those of the estimate and of the reference are correlated
-as much as this after it. With less, the part that they do not have in common is 1.7 times the one
-that they have. Something that stands, seen with noise, has a few times 1/√N; a short way that is
-seen at all has nearly 1. What moves along a line is aligned with it, though the rotation about the
-line is one of noise."""
+_LEAST_CORRELATION, _STANDS_M = 0.5, 0.05
+"""What spreads over so many metres (rms) or less stands, unless estimate and reference are
+correlated as much as this after the alignment. With less, the part that they do not have in common
+is 1.7 times the one that they have. Something that stands, seen with noise, has a few times 1/√N; a
+short way that is seen at all has nearly 1. An estimate that has drifted far from a reference that
+moves has little, too, but no small spread: it is aligned as well as it can be, and its error is
+large. What moves along a line is aligned with it, though the rotation about the line is one of
+noise."""
 _RELATIVE_RANK = 1e-14
 """A correlation, or a singular value over the largest one, below this counts as zero."""
 
@@ -125,10 +128,10 @@ def _umeyama(
         reference: (N, 3) points, N ≥ 3.
         estimate: (N, 3) the same points in another frame.
         with_scale: estimate the scale too (Sim(3)); otherwise it is 1 (SE(3)).
-        least: correlation of the points with which their rotation is defined.
+        least: correlation of points that stand with which their rotation is defined.
 
     Raises:
-        DataError: if the points lie on one line, or coincide but for what is not the same in both:
+        DataError: if the points lie on one line, or stand but for what is not the same in both:
             their rotation is undefined.
     """
     mean_reference, mean_estimate = reference.mean(axis=0), estimate.mean(axis=0)
@@ -137,9 +140,10 @@ def _umeyama(
     U, d, Vt = np.linalg.svd(covariance)
     common = len(reference) * float(d.sum())  # as well in a mirror, which is no matter of noise
     is_line = len(reference) < 3 or d[1] <= _RELATIVE_RANK * max(d[0], np.finfo(float).tiny)
-    if is_line or not _determined(common, wanted, centred, least):
+    in_metres = [wanted] if with_scale else [wanted, centred]
+    if is_line or not _determined(common, wanted, centred, least, in_metres):
         raise DataError(
-            f"cannot align {len(reference)} positions that lie on one line or coincide; "
+            f"cannot align {len(reference)} positions that stand or lie on one line; "
             "use --align none or yaw, or a recording that moves"
         )
     signs = np.array([1.0, 1.0, np.sign(np.linalg.det(U) * np.linalg.det(Vt))])
@@ -149,17 +153,27 @@ def _umeyama(
     return Similarity(rotation, mean_reference - scale * rotation @ mean_estimate, scale)
 
 
-def _determined(common: float, reference: FloatArray, estimate: FloatArray, least: float) -> bool:
+def _determined(
+    common: float,
+    reference: FloatArray,
+    estimate: FloatArray,
+    least: float,
+    in_metres: Sequence[FloatArray],
+) -> bool:
     """Whether points determine a rotation.
 
     Args:
         common: Σ r·e of the two, at the best rotation.
         reference: (N, 2 or 3) the points r that it turns, with a mean of zero.
         estimate: (N, 2 or 3) the same e.
-        least: correlation of the two with which they do.
+        least: correlation of the two with which they do though one of them stands.
+        in_metres: those of the two whose unit of length is known.
     """
     sizes = float(np.linalg.norm(reference)) * float(np.linalg.norm(estimate))
-    return bool(common > max(least, _RELATIVE_RANK) * sizes)
+    if common <= _RELATIVE_RANK * sizes:
+        return False
+    spread_m = min(float(np.linalg.norm(points)) for points in in_metres) / np.sqrt(len(reference))
+    return bool(common > least * sizes or spread_m > _STANDS_M)
 
 
 def _align_yaw(reference: FloatArray, estimate: FloatArray, least: float) -> Similarity:
@@ -171,20 +185,22 @@ def _align_yaw(reference: FloatArray, estimate: FloatArray, least: float) -> Sim
     Args:
         reference: (N, 3) points.
         estimate: (N, 3) the same points in a frame whose z axis is vertical too.
-        least: correlation of the points across the vertical with which their heading is defined.
+        least: correlation across the vertical of points that stand with which it is defined.
 
     Raises:
-        DataError: if no point is off the vertical through the mean, but for what is not the same in
-            both: the heading is undefined.
+        DataError: if the points stand or lie above one another, but for what is not the same in
+            both: their heading is undefined.
     """
     mean_reference, mean_estimate = reference.mean(axis=0), estimate.mean(axis=0)
     wanted, centred = reference - mean_reference, estimate - mean_estimate
     C = wanted.T @ centred
     sine, cosine = C[1, 0] - C[0, 1], C[0, 0] + C[1, 1]
     common = float(np.hypot(sine, cosine))
-    if not _determined(common, wanted[:, :2], centred[:, :2], least):
+    across = wanted[:, :2], centred[:, :2]
+    if not _determined(common, *across, least, across):
         raise DataError(
-            f"cannot align the yaw of {len(reference)} positions above one another; "
+            f"cannot align the yaw of {len(reference)} positions that stand, or lie above one "
+            "another; "
             "use --align none, or a recording that moves"
         )
     rotation = Rotation.from_euler("z", np.arctan2(sine, cosine)).as_matrix()

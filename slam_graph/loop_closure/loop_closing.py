@@ -94,6 +94,13 @@ class LoopClosures:
             return seen
         return Poses(seen.rotations, self.scales[at, None] * seen.translations)
 
+    def accepted_ns(self) -> IntArray:
+        """(A, 2) times of the two keyframes of each loop closure that was accepted."""
+        stamps = [keyframe.stamp_ns for keyframe in self.keyframes]
+        kept = (self.loops[k] for k in np.flatnonzero(self.accepted))
+        ends = [(stamps[loop.first], stamps[loop.second]) for loop in kept]
+        return np.array(ends, np.int64).reshape(-1, 2)
+
     def across(self, begin_ns: int, end_ns: int) -> int:
         """How many accepted loop closures join what is before a segment with the segment.
 
@@ -101,9 +108,8 @@ class LoopClosures:
             begin_ns: time of its first state.
             end_ns: time of its last state.
         """
-        kept = (self.loops[k] for k in np.flatnonzero(self.accepted))
-        times = [[self.keyframes[k].stamp_ns for k in (loop.first, loop.second)] for loop in kept]
-        return sum(min(pair) < begin_ns <= max(pair) <= end_ns for pair in times)
+        pairs = self.accepted_ns().tolist()
+        return sum(min(pair) < begin_ns <= max(pair) <= end_ns for pair in pairs)
 
     def csv_lines(self) -> Iterator[str]:
         """The loop closures that passed verification, as CSV."""

@@ -18,7 +18,7 @@ from typing import Any, Literal
 import gtsam
 import numpy as np
 from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
+from scipy.sparse.csgraph import breadth_first_order, connected_components
 from scipy.spatial.transform import Rotation
 
 from slam_graph.arrays import BoolArray, FloatArray, IntArray
@@ -33,8 +33,8 @@ InformationRepair = Literal["nearest", "isotropic"]
 or the isotropic information of its blocks of translation and rotation, as SE-Sync takes it."""
 
 _LONGEST_STEP = 10
-"""Where ids do not count poses, but are times, say: two poses whose ids are farther apart than so
-many usual steps are not consecutive."""
+"""Ids may count poses, of which a few are missing, or be times: two poses whose ids are farther
+apart than so many usual steps (the median) are not consecutive."""
 
 _MAX_STAMP_S = 9_000_000_000
 """Larger ids, taken as seconds, do not fit into nanoseconds."""
@@ -125,9 +125,8 @@ class PoseGraph(Displayed):
         rotation_information: whether the information of a 3D rotation belongs to the angle (GTSAM)
             or to the vector part of the quaternion (g2o).
         name: of the graph.
-        odometry: (M,) whether each edge is odometry; those between consecutive poses if not given,
-            which follow each other in the order of ids, without a gap as between two sessions.
-            Files do not carry it.
+        odometry: (M,) whether each edge is odometry; those between consecutive poses if not given
+            (`is_odometry`). Files do not carry it.
     """
 
     keys: IntArray
@@ -206,18 +205,21 @@ class PoseGraph(Displayed):
         κ = 1.5 / np.trace(np.linalg.inv(information[:, 3:, 3:]), axis1=1, axis2=2)
         return κ, τ
 
-    @property
+    @cached_property
     def is_odometry(self) -> BoolArray:
-        """(M,) whether an edge is odometry; all others are loop closures."""
+        """(M,) whether an edge is odometry; all others are loop closures.
+
+        Unless `odometry` says it: edges between poses that follow each other in the order of ids,
+        without a gap of more than ten usual steps as between two sessions. An edge across such a
+        gap is odometry, too, if without it the graph would be in two parts: nothing contradicts it.
+        """
         if self.odometry is not None:
             return self.odometry
-        apart = np.abs(np.diff(self.edges, axis=1))[:, 0]
+        follows = np.abs(np.diff(self.edges, axis=1))[:, 0] == 1
         steps = np.abs(np.diff(self.keys[self.edges], axis=1))[:, 0]
         usual = np.median(np.diff(self.keys)) if len(self.keys) > 1 else 1
-        consecutive: BoolArray = (apart == 1) & (
-            steps <= (usual if usual == 1 else _LONGEST_STEP * usual)
-        )
-        return consecutive
+        near: BoolArray = follows & (steps <= _LONGEST_STEP * usual)
+        return near if np.array_equal(near, follows) else near | (follows & _bridges(self))
 
     @cached_property
     def components(self) -> IntArray:
@@ -269,3 +271,28 @@ class PoseGraph(Displayed):
         space = poses.in_space()
         quaternions = Rotation.from_matrix(space.rotations).as_quat()
         return Trajectory(seconds * 10**9, space.translations, quaternions)
+
+
+def _bridges(graph: PoseGraph) -> BoolArray:
+    """(M,) which edges alone join two parts of the graph.
+
+    Each edge beside a spanning tree closes a cycle and has a random label; it cancels in all
+    branches that have both of its ends. So a branch without a label hangs on its tree edge alone.
+    """
+    n, m = len(graph.keys), len(graph.edges)
+    roots = np.column_stack([graph.anchors, np.full(len(graph.anchors), n)])  # all hang on one more
+    ends = np.concatenate([np.sort(graph.edges, axis=1), roots])
+    links = coo_matrix((np.ones(len(ends)), tuple(ends.T)), shape=(n + 1, n + 1))
+    order, before = breadth_first_order(links.tocsr(), n, directed=False)
+    row_of = {pair: row for row, pair in enumerate(map(tuple, ends.tolist()))}
+    children = order[:0:-1].tolist()  # leaves first
+    rows = [row_of[min(i, before[i]), max(i, before[i])] for i in children]
+    labels = np.random.default_rng(0).integers(1, 2**63, len(ends))
+    labels[rows] = 0
+    marks = np.zeros(n + 1, np.int64)
+    np.bitwise_xor.at(marks, ends, labels[:, None])
+    alone = np.zeros(len(ends), np.bool_)
+    for child, row in zip(children, rows, strict=True):
+        alone[row] = marks[child] == 0
+        marks[before[child]] ^= marks[child]
+    return alone[:m]

@@ -1,21 +1,47 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""A folder that has files of an earlier result: they are removed before another is written there.
+"""A folder that has files of an earlier result: they make room before another is written there.
 
-So the files of two results are never taken for one. What others wrote into the folder stays.
+So the files of two results are never taken for one, and none is lost that may be the only copy:
+
+- What says what the earlier result found is *derived*, and removed: trajectories, states, points,
+  tables, settings, calibrations, pictures, graphs and the log. A new result of the same kind has
+  its own, and without its metrics a part of them tells nothing.
+- A map and a recording for the viewer are of use by themselves, and took a run to make. They are
+  kept under other names (`map-earlier.slam`) where no new one is written in their place.
+- A result of another kind is refused: nothing that is written would take its place.
+- What others wrote into the folder stays.
 """
 
 from __future__ import annotations
 
 import json
+import os
 import re
 from pathlib import Path
+from typing import Any, Literal
 
+from slam_graph.errors import DataError
 from slam_graph.files import Files
 from slam_graph.results import result_files as names
 
+Kind = Literal["run", "pose graph", "bundle adjustment", "comparison"]
+"""What a result is of."""
+
 _MARKS = frozenset({"schema_version", "versions"})
 """What `metrics.json` of every result has."""
+
+_KINDS: dict[str, Kind] = {
+    "algorithm": "run",
+    "graph": "pose graph",
+    "problem": "bundle adjustment",
+}
+"""Of which kind a result is, by what its `metrics.json` has."""
+
+_MARKS_OF_COMPARISON = frozenset({"rows", "failures"})
+"""What `summary.json` of a comparison has."""
+
+_REPLACED = "another result is written in the place of this one, and is not complete"
 
 _LOG, _RECORDING = "run.log", "recording.rrd"
 
@@ -47,39 +73,93 @@ def is_file_of_result(name: str) -> bool:
     return name in _FILES or _NUMBERED.fullmatch(name) is not None
 
 
-def remove_earlier(folder: Path) -> None:
-    """Remove the files of an earlier result, if there is one; all others stay.
-
-    The trajectory goes first, as there is no result without; `metrics.json` stays to be replaced,
-    so that what is left after an interruption is known as files of a result.
+def refuse_other_kind(folder: Path, kind: Kind) -> None:
+    """Make sure that a folder has no result of another kind.
 
     Args:
         folder: that is written to; it may be missing.
+        kind: of the result that is to be written.
+
+    Raises:
+        DataError: if it has one.
+    """
+    for found in (_kind_of_metrics(folder / names.METRICS), _kind_of_summary(folder)):
+        if found not in (None, kind):
+            raise DataError(
+                f"{folder}: has the result of a {found}, which the result of a {kind} does not "
+                "replace; choose another folder, or move that result away"
+            )
+
+
+def make_room(folder: Path) -> list[tuple[Path, Path]]:
+    """Remove what an earlier result derived, if there is one, and set aside what is its only copy.
+
+    First its `metrics.json` says that it is no longer complete. The trajectory goes next, as no
+    result is read without it; `metrics.json` stays to be replaced, so that what is left after an
+    interruption is known as files of a result.
+
+    Args:
+        folder: that is written to; it may be missing.
+
+    Returns:
+        What was set aside: the old and the new path of each file.
 
     Raises:
         DataError: if a file cannot be removed.
     """
     metrics = folder / names.METRICS
-    if not _is_of_result(metrics):
-        return
+    if _kind_of_metrics(metrics) is None:
+        return []
+    table = _read(metrics)
+    written_ns = metrics.stat().st_mtime_ns
+    table |= {"status": "unfinished", "message": _REPLACED}
+    Files.write_text(metrics, [json.dumps(table, indent=2), "\n"])
+    with Files.writing(metrics):
+        os.utime(metrics, ns=(written_ns, written_ns))  # a later recording stays later
     paths = [path for path in sorted(folder.iterdir()) if is_file_of_result(path.name)]
     of_objects = sorted((folder / _OBJECTS).glob("*"))
     paths += [path for path in of_objects if is_file_of_result(f"{_OBJECTS}/{path.name}")]
-    recording = folder / _RECORDING
-    if recording.is_file() and recording.stat().st_mtime_ns <= metrics.stat().st_mtime_ns:
-        paths.append(recording)  # a later one is of the run that is to be saved
     for path in [folder / names.TRAJECTORY, *paths]:
         with Files.writing(path):
-            if path.is_file() or path.is_symlink():
+            if path.name != names.MAP_NAME and (path.is_file() or path.is_symlink()):
                 path.unlink()
     if (folder / _OBJECTS).is_dir() and not any((folder / _OBJECTS).iterdir()):
         (folder / _OBJECTS).rmdir()
+    recording, kept = folder / _RECORDING, [folder / names.MAP_NAME]
+    if recording.is_file() and recording.stat().st_mtime_ns <= written_ns:
+        kept.append(recording)  # a later one is of the run that is to be saved
+    return [(path, _set_aside(path)) for path in kept if path.is_file()]
 
 
-def _is_of_result(metrics: Path) -> bool:
-    """Whether a file is the `metrics.json` of a result."""
+def _set_aside(path: Path) -> Path:
+    """Give a file the name `…-earlier`, with a number where that is taken; returns the new path."""
+    number, other = 1, path.with_stem(f"{path.stem}-earlier")
+    while other.exists() or other.is_symlink():
+        number += 1
+        other = path.with_stem(f"{path.stem}-earlier-{number}")
+    with Files.writing(other):
+        os.replace(path, other)
+    return other
+
+
+def _kind_of_metrics(metrics: Path) -> Kind | None:
+    """Of which kind the result is that has this `metrics.json`; None if it is of none."""
+    table = _read(metrics)
+    if not table.keys() >= _MARKS:
+        return None
+    return next((kind for key, kind in _KINDS.items() if key in table), None)
+
+
+def _kind_of_summary(folder: Path) -> Kind | None:
+    """Whether a folder is that of a comparison."""
+    is_one = _read(folder / "summary.json").keys() >= _MARKS_OF_COMPARISON
+    return "comparison" if is_one else None
+
+
+def _read(path: Path) -> dict[str, Any]:
+    """The table of a JSON file; an empty one if there is none."""
     try:
-        table = json.loads(metrics.read_text(encoding="utf-8"))
+        table = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError):
-        return False
-    return isinstance(table, dict) and table.keys() >= _MARKS
+        return {}
+    return table if isinstance(table, dict) else {}

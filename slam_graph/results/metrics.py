@@ -255,6 +255,7 @@ def loop_closure_table(
         "keyframes": len(loops.keyframes),
         "verified": len(loops.loops),
         "accepted": int(loops.accepted.sum()),
+        "world_breaks_ns": list(breaks_ns),
         "accuracy": accuracy_table(truth, corrected, scaled_camera, breaks_ns),
     }
 

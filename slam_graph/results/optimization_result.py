@@ -19,10 +19,9 @@ from slam_graph.bundle_adjustment import BalPolicy, BalSolution
 from slam_graph.display import Displayed
 from slam_graph.files import Files
 from slam_graph.pose_graph import Certificate, PoseGraphPolicy, PoseGraphSolution
-from slam_graph.results.earlier_result import remove_earlier
+from slam_graph.results.folders_written import FoldersWritten
 from slam_graph.results.map_output import write_ply
 from slam_graph.results.metrics import SCHEMA_VERSION, Table, finite, versions
-from slam_graph.results.result_files import ResultFolder
 
 
 @dataclass(eq=False, repr=False)
@@ -34,12 +33,14 @@ class BalResult(Displayed):
         solution: the estimates.
         seconds: wall time of each part.
         warnings: counted faults and repairs.
+        folders_written: folders that have files of this result, which stay when it is saved again.
     """
 
     policy: BalPolicy
     solution: BalSolution
     seconds: dict[str, float] = field(default_factory=dict)
     warnings: Counter[str] = field(default_factory=Counter)
+    folders_written: FoldersWritten = field(default_factory=FoldersWritten)
 
     def __repr__(self) -> str:
         part, minimum = self.solution.part.problem, self.solution.minimum
@@ -94,24 +95,26 @@ class BalResult(Displayed):
     def save(self, folder: Path | str) -> list[Path]:
         """Write all files into a folder, each whole or not at all.
 
-        Files of another result in the folder are removed before (`earlier_result.py`).
+        Files of another bundle adjustment in the folder are removed before (`earlier_result.py`).
+        `metrics.json` is last; until then it has the status `unfinished`.
 
         Args:
             folder: made if it is missing.
 
         Returns:
             The files, in the order in which they were written.
+
+        Raises:
+            DataError: if the folder has a result of another kind, or a file cannot be written.
         """
-        remove_earlier(Path(folder))
-        files = ResultFolder(folder)
-        files.json("metrics.json", self.metrics)
-        files.text("problem.txt", self.solution.problem_lines())
-        files.text("optimized.txt", self.solution.lines())
-        files.text("config.yaml", [self.policy.as_yaml()])
-        adjusted = self.solution.adjusted
-        write_ply(files.path("scene.ply"), adjusted.points, adjusted.centres())
-        with files.appearing("bundle_adjustment.png") as partial:
-            self.plot().write(partial)
+        adjusted, written = self.solution.adjusted, self.folders_written
+        with written.complete(Path(folder), "bundle adjustment", self.metrics) as files:
+            files.text("problem.txt", self.solution.problem_lines())
+            files.text("optimized.txt", self.solution.lines())
+            files.text("config.yaml", [self.policy.as_yaml()])
+            write_ply(files.path("scene.ply"), adjusted.points, adjusted.centres())
+            with files.appearing("bundle_adjustment.png") as partial:
+                self.plot().write(partial)
         return files.files
 
     def save_problem(self, path: Path | str) -> None:
@@ -145,6 +148,7 @@ class PoseGraphResult(Displayed):
         covariances: (N, k, k) of all poses, if they were asked for.
         seconds: wall time of each part.
         warnings: counted faults and repairs.
+        folders_written: folders that have files of this result, which stay when it is saved again.
     """
 
     policy: PoseGraphPolicy
@@ -153,6 +157,7 @@ class PoseGraphResult(Displayed):
     covariances: FloatArray | None = None
     seconds: dict[str, float] = field(default_factory=dict)
     warnings: Counter[str] = field(default_factory=Counter)
+    folders_written: FoldersWritten = field(default_factory=FoldersWritten)
 
     def __repr__(self) -> str:
         graph, minimum = self.solution.graph, self.solution.minimum
@@ -201,28 +206,30 @@ class PoseGraphResult(Displayed):
     def save(self, folder: Path | str) -> list[Path]:
         """Write all files into a folder, each whole or not at all.
 
-        Files of another result in the folder are removed before (`earlier_result.py`).
+        Files of another pose graph in the folder are removed before (`earlier_result.py`).
+        `metrics.json` is last; until then it has the status `unfinished`.
 
         Args:
             folder: made if it is missing.
 
         Returns:
             The files, in the order in which they were written.
+
+        Raises:
+            DataError: if the folder has a result of another kind, or a file cannot be written.
         """
         solution, graph = self.solution, self.solution.graph
-        remove_earlier(Path(folder))
-        files = ResultFolder(folder)
-        files.json("metrics.json", self.metrics)
-        files.text("optimized.g2o", solution.g2o_lines())
-        files.text("trajectory.tum", graph.trajectory(solution.poses).tum_lines())
-        files.text("edges.csv", self._edge_lines())
-        files.text("config.yaml", [self.policy.as_yaml()])
-        if self.covariances is not None:
-            files.text("covariances.csv", self._covariance_lines(self.covariances))
-        if self.certificate is not None:
-            files.text("certified.g2o", solution.g2o_lines(self.certificate.poses))
-        with files.appearing("pose_graph.png") as partial:
-            self.plot().write(partial)
+        with self.folders_written.complete(Path(folder), "pose graph", self.metrics) as files:
+            files.text("optimized.g2o", solution.g2o_lines())
+            files.text("trajectory.tum", graph.trajectory(solution.poses).tum_lines())
+            files.text("edges.csv", self._edge_lines())
+            files.text("config.yaml", [self.policy.as_yaml()])
+            if self.covariances is not None:
+                files.text("covariances.csv", self._covariance_lines(self.covariances))
+            if self.certificate is not None:
+                files.text("certified.g2o", solution.g2o_lines(self.certificate.poses))
+            with files.appearing("pose_graph.png") as partial:
+                self.plot().write(partial)
         return files.files
 
     def save_problem(self, path: Path | str) -> None:

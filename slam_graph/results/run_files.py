@@ -7,14 +7,12 @@ Until all of them are there `metrics.json` has the status `unfinished`.
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from slam_graph.datasets import kalibr_text
 from slam_graph.files import Files
 from slam_graph.results import result_files as names
-from slam_graph.results.earlier_result import remove_earlier
 from slam_graph.results.free_memory import give_back
 from slam_graph.results.map_output import save_map, write_ply
 from slam_graph.results.object_files import save_objects
@@ -23,12 +21,11 @@ from slam_graph.results.result_files import MAP_NAME, ResultFolder
 if TYPE_CHECKING:
     from slam_graph.results.run_result import RunResult
 
-GOES_ON = "the run goes on, or was ended before its files were complete"
-"""Message of a run with the status `unfinished`."""
-
 
 def save_run(result: RunResult, folder: Path) -> list[Path]:
-    """Write all files of a run, in the place of those of another one.
+    """Write all files of a run, in the place of those of another one (`earlier_result.py`).
+
+    What the run itself wrote there stays, such as its log and its recording for the viewer.
 
     Args:
         result: of a run that ended.
@@ -38,12 +35,21 @@ def save_run(result: RunResult, folder: Path) -> list[Path]:
         The files, in the order in which they were written.
 
     Raises:
-        DataError: if a file cannot be written or removed.
+        DataError: if the folder has a result of another kind, or a file cannot be written or
+            removed.
     """
-    files = begin_folder(result, folder)
-    result.begun.discard(folder.resolve())
-    table = {**result.metrics, "status": "unfinished", "message": GOES_ON}
-    Files.write_text(folder / names.METRICS, [json.dumps(table, indent=2), "\n"])
+    with result.folders_written.complete(folder, "run", result.metrics) as files:
+        _save_estimate(result, files)
+        give_back()  # what the run and the files took: Matplotlib takes 25 MB more
+        with files.appearing("trajectory.png") as partial:
+            result.plot().write(partial)
+        if result.slam_map is not None:  # last: it is the file that a full disk is too small for
+            save_map(result.slam_map, files.path(MAP_NAME), force=True)
+    return files.files
+
+
+def _save_estimate(result: RunResult, files: ResultFolder) -> None:
+    """All files but the metrics, the picture and the map."""
     _save_trajectories(result, files)
     if result.localization is not None:
         files.text(names.IN_MAP, result.localization.trajectory().tum_lines())
@@ -58,25 +64,6 @@ def save_run(result: RunResult, folder: Path) -> list[Path]:
     for stamp_ns, graph in result.graphs.items():
         for name, text in graph.texts().items():
             files.text(f"graph_{stamp_ns}_{name}", [text])
-    files.json(names.METRICS, result.metrics)
-    give_back()  # what the run and the files took: Matplotlib takes 25 MB more
-    with files.appearing("trajectory.png") as partial:
-        result.plot().write(partial)
-    if result.slam_map is not None:  # last: it is the file that a full disk is too small for
-        save_map(result.slam_map, files.path(MAP_NAME), force=True)
-    return files.files
-
-
-def begin_folder(result: RunResult, folder: Path) -> ResultFolder:
-    """The folder of a run, without files of another one.
-
-    Raises:
-        DataError: if it cannot be made, or a file cannot be removed.
-    """
-    if folder.resolve() not in result.begun:
-        remove_earlier(folder)
-        result.begun.add(folder.resolve())
-    return ResultFolder(folder)
 
 
 def _save_trajectories(result: RunResult, files: ResultFolder) -> None:

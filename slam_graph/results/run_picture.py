@@ -42,9 +42,6 @@ _COLUMNS = ("AAAAABBB", "CDEF")
 _WIDTHS_INCHES = (5.0, 5.8)
 _HEIGHT_INCHES = 6.6
 
-_UNPLACED_M = 100.0
-"""σ of a position beyond which nothing is known of it."""
-
 _POINTS_REACH = 0.4
 """Features are drawn as far from the path as this part of its largest extent."""
 
@@ -108,6 +105,7 @@ class RunView:
         truth: ground truth, or None.
         points: (P, 3) features.
         start_ns: where time begins.
+        path_breaks_ns: times between the worlds of the paths, after loop closure.
     """
 
     estimates: Mapping[str, PoseEstimate]
@@ -115,25 +113,25 @@ class RunView:
     truth: Trajectory | None
     points: FloatArray
     start_ns: int
+    path_breaks_ns: Sequence[int] = ()
 
     def moved(self, similarity: Similarity) -> RunView:
         """All but the truth in another world."""
-        return RunView(
-            {name: estimate.moved(similarity) for name, estimate in self.estimates.items()},
-            {name: similarity.apply(path) for name, path in self.paths.items()},
-            self.truth,
-            similarity.scale * self.points @ similarity.rotation.T + similarity.translation,
-            self.start_ns,
+        points = similarity.scale * self.points @ similarity.rotation.T + similarity.translation
+        return replace(
+            self,
+            estimates={name: own.moved(similarity) for name, own in self.estimates.items()},
+            paths={name: similarity.apply(path) for name, path in self.paths.items()},
+            points=points,
         )
 
     def at_camera(self, body_T_camera: gtsam.Pose3) -> RunView:
         """The same of a camera on the body."""
-        return RunView(
-            {name: estimate.at_camera(body_T_camera) for name, estimate in self.estimates.items()},
-            {name: path.mounted(body_T_camera) for name, path in self.paths.items()},
-            None if self.truth is None else self.truth.mounted(body_T_camera),
-            self.points,
-            self.start_ns,
+        return replace(
+            self,
+            estimates={name: own.at_camera(body_T_camera) for name, own in self.estimates.items()},
+            paths={name: path.mounted(body_T_camera) for name, path in self.paths.items()},
+            truth=None if self.truth is None else self.truth.mounted(body_T_camera),
         )
 
     def aligned(self, mode: AlignmentMode = "yaw", breaks_ns: Sequence[int] = ()) -> RunView:
@@ -143,8 +141,8 @@ class RunView:
 
         Args:
             mode: `yaw` and translation; `se3` where gravity was not measured.
-            breaks_ns: times between worlds. Each is aligned by itself, and paths after loop
-                closure as a whole; of points it is not known in which world they are.
+            breaks_ns: times between worlds. Each is aligned by itself, and so are those that are
+                left in the paths; of points it is not known in which world they are.
         """
         if self.truth is None:
             return self
@@ -160,13 +158,15 @@ class RunView:
             stamps_ns = own.trajectory.stamps_ns
             known, scales = onto.known(stamps_ns), onto.scales(stamps_ns)
             covariances = _in_units(own.covariances[known], scales[known, None])
-            places = np.trace(covariances[:, 3:, 3:], axis1=1, axis2=2)
-            covariances[places > _UNPLACED_M**2] = np.nan  # of the worlds to one another
+            places = np.diagonal(own.covariances[known, 3:, 3:], axis1=1, axis2=2)
+            covariances[~onto.placed(places)] = np.nan  # of the worlds to one another
             estimates[name] = PoseEstimate(onto.apply(own.trajectory), covariances)
         for name, path in self.paths.items():
             with suppress(DataError):
-                whole = evaluation.ape(self.truth, path, alignment=mode).alignment
-                paths[name] = whole.apply(path)
+                left = evaluation.ape(
+                    self.truth, path, alignment=mode, breaks_ns=self.path_breaks_ns
+                )
+                paths[name] = left.alignment.apply(path)
         return replace(self, estimates=estimates, paths=paths, points=np.zeros((0, 3)))
 
 
@@ -240,9 +240,7 @@ def with_covariances_after_alignment(
     if similarity is None:
         return view.aligned(free)
     moved = view.moved(similarity)
-    return RunView(
-        {**moved.estimates, **estimates}, moved.paths, view.truth, moved.points, view.start_ns
-    )
+    return replace(moved, estimates={**moved.estimates, **estimates})
 
 
 def run_figure(view: RunView, metrics: Mapping[str, Any]) -> Picture:

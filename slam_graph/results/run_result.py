@@ -19,6 +19,7 @@ from slam_graph.config import RunConfig
 from slam_graph.errors import DataError, EstimationError
 from slam_graph.geometry import AlignmentMode, StateHistory, Trajectory
 from slam_graph.results import metrics as tables
+from slam_graph.results.folders_written import FoldersWritten
 from slam_graph.results.free_memory import give_back
 from slam_graph.results.localization_result import LocalizationLog
 from slam_graph.results.map_output import PointMap
@@ -38,6 +39,8 @@ from slam_graph.results.segments import Segments
 from slam_graph.sensors import AidingData, Rig
 
 if TYPE_CHECKING:
+    import gtsam
+
     from slam_graph.backend import FinalBa, MovingObjects, WindowGraph
     from slam_graph.loop_closure import LoopClosures
     from slam_graph.maps import SlamMap
@@ -74,7 +77,7 @@ class RunResult(RunSummary):
         evidence: statistics of how consistent the run is by itself, by name; None if not judged.
         graphs: factor graphs of the back end by the stamps (ns) of their frames, if asked for.
         warnings: counted faults and rejections.
-        begun: folders that have files of this run already, as `save_so_far` wrote them.
+        folders_written: folders that have files of this run, which stay when it is saved again.
     """
 
     Logs = RunLogs
@@ -98,7 +101,7 @@ class RunResult(RunSummary):
     evidence: Mapping[str, float | None] | None = None
     graphs: dict[int, WindowGraph] = field(default_factory=dict)
     warnings: Counter[str] = field(default_factory=Counter)
-    begun: set[Path] = field(default_factory=set)
+    folders_written: FoldersWritten = field(default_factory=FoldersWritten)
 
     def __repr__(self) -> str:
         return (
@@ -168,6 +171,11 @@ class RunResult(RunSummary):
         return self.history.free
 
     @property
+    def scaled_camera(self) -> gtsam.Pose3 | None:
+        """body_T_camera of the camera whose path is known up to a scale; None for metres."""
+        return self.history.scaled_camera
+
+    @property
     def sigmas(self) -> FloatArray:
         """(N, 15) standard deviations of the states, in the order of `NavState.covariance`."""
         return self.history.sigmas()
@@ -197,10 +205,12 @@ class RunResult(RunSummary):
         """(L, 2) times of the two keyframes of each accepted loop closure."""
         if self.loops is None:
             return np.zeros((0, 2), np.int64)
-        stamps = [keyframe.stamp_ns for keyframe in self.loops.keyframes]
-        kept = (self.loops.loops[k] for k in np.flatnonzero(self.loops.accepted))
-        ends = [(stamps[loop.first], stamps[loop.second]) for loop in kept]
-        return np.array(ends, np.int64).reshape(-1, 2)
+        return self.loops.accepted_ns()
+
+    @property
+    def _breaks_of_loops_ns(self) -> list[int]:
+        """Times between the worlds that are left after loop closure."""
+        return self.segments.breaks_ns(self.loop_ends_ns)
 
     @property
     def keyframes_ns(self) -> IntArray:
@@ -261,7 +271,7 @@ class RunResult(RunSummary):
         offset_ns = round(self.causal_rig.pose_offset_s * 1e9)
         extent = tables.extent_table(asked, offset_ns, logs.frames, self.trajectory, self.segments)
         frames = max(logs.frames, 1)
-        located, camera = self.localization, self.history.scaled_camera
+        located, camera = self.localization, self.scaled_camera
         breaks = self.segments.breaks_ns()
         table: dict[str, Any] = tables.finite(
             {
@@ -286,7 +296,7 @@ class RunResult(RunSummary):
                 "accuracy": tables.accuracy_table(truth, self.trajectory, camera, breaks),
                 "final_ba": tables.final_ba_table(self.final_ba, truth, breaks),
                 "loop_closure": tables.loop_closure_table(
-                    self.loops, self.loop_closed, truth, camera, self.segments.breaks_ns(True)
+                    self.loops, self.loop_closed, truth, camera, self._breaks_of_loops_ns
                 ),
                 "slam_map": None if self.slam_map is None else self.slam_map.summary(),
                 "localization": (
@@ -330,13 +340,18 @@ class RunResult(RunSummary):
     def save(self, folder: Path | str) -> list[Path]:
         """Write all files of the run, the trajectory first; each appears whole or not at all.
 
-        Files of another result in the folder are removed before (`earlier_result.py`).
+        Files of another run in the folder are removed before, but a map or a recording that is not
+        written anew is kept as `map-earlier.slam` or `recording-earlier.rrd`. Saved again the run
+        replaces its own files, and leaves others as they are.
 
         Args:
             folder: made if it is missing.
 
         Returns:
             The files, in the order in which they were written.
+
+        Raises:
+            DataError: if the folder has a result of another kind, or a file cannot be written.
         """
         from slam_graph.results.run_files import save_run
 
@@ -362,7 +377,8 @@ class RunResult(RunSummary):
             histories[SMOOTHED] = self.final_ba.history
         estimates = {name: PoseEstimate.of_history(found) for name, found in histories.items()}
         loops, truth, began_ns = self._paths_of_loops(), self.groundtruth, self.input.states_ns[0]
-        view = RunView(estimates, loops, truth, self.points, began_ns)
+        left_ns = self._breaks_of_loops_ns
+        view = RunView(estimates, loops, truth, self.points, began_ns, left_ns)
         view = with_covariances_after_alignment(
             view, histories, self.start_was_given, self.final_ba, self.segments.breaks_ns()
         )

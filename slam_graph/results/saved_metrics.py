@@ -88,6 +88,7 @@ class _Adjustment(_Table):
 class _Loops(_Table):
     accepted: _Count
     accuracy: _Accuracy | None
+    world_breaks_ns: list[_Time] = []
 
 
 class _Localization(_Table):

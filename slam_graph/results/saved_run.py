@@ -281,6 +281,7 @@ class SavedRun(RunSummary):
             self.groundtruth,
             self.points,
             self.metrics["extent"]["start_ns"] + round(self.rig.pose_offset_s * 1e9),
+            (self.metrics["loop_closure"] or {}).get("world_breaks_ns", []),
         )
         if self.scaled_camera is not None and view.truth is not None:
             view = view.at_camera(self.scaled_camera)

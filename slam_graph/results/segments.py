@@ -14,8 +14,10 @@ from typing import Any, ClassVar, Literal, Protocol
 
 import gtsam
 import numpy as np
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import connected_components
 
-from slam_graph.arrays import FloatArray
+from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.geometry import Trajectory
 
 JoinedBy = Literal["start", "imu", "none"]
@@ -204,18 +206,34 @@ class Segments:
             groups[-1].append(segment)
         return groups
 
-    def breaks_ns(self, loops_closed: bool = False) -> list[int]:
+    def breaks_ns(self, joined_ns: IntArray | None = None) -> list[int]:
         """(W - 1,) times between worlds: halfway from the end of one to the begin of the next.
 
+        Where a world is gone back to after another one, there is a break before and after that.
+
         Args:
-            loops_closed: whether worlds that loop closures have joined are one.
+            joined_ns: (K, 2) pairs of times that are in one world, beyond what `joined_by` says:
+                those of accepted loop closures.
         """
-        worlds = self.worlds()
+        world = self._world_numbers(np.zeros((0, 2), np.int64) if joined_ns is None else joined_ns)
         return [
-            (before[-1].end_ns + world[0].begin_ns) // 2
-            for before, world in pairwise(worlds)
-            if not (loops_closed and any(segment.loops for segment in world))
+            (before.end_ns + after.begin_ns) // 2
+            for (before, after), is_break in zip(
+                pairwise(self._all), np.diff(world) != 0, strict=True
+            )
+            if is_break
         ]
+
+    def _world_numbers(self, joined_ns: IntArray) -> IntArray:
+        """(S,) number of the world of each segment, where pairs (K, 2) of times are in one."""
+        if len(self._all) < 2:
+            return np.zeros(len(self._all), np.int64)
+        begins_ns = [segment.begin_ns for segment in self._all]
+        places = np.searchsorted(begins_ns, joined_ns, "right") - 1  # of a segment and what follows
+        pairs = [(k - 1, k) for k in range(1, len(begins_ns)) if self._all[k].joined_by != "none"]
+        first, second = np.vstack([np.maximum(places, 0), np.reshape(pairs, (-1, 2))]).astype(int).T
+        links = csr_array((np.ones(len(first)), (first, second)), shape=(len(begins_ns),) * 2)
+        return np.asarray(connected_components(links, directed=False)[1], np.int64)
 
     def csv_lines(self, trajectory: Trajectory) -> Iterator[str]:
         """Segments as CSV; times between two of them have no state.

@@ -8,16 +8,10 @@ from dataclasses import replace
 from pathlib import Path
 
 from slam_graph.results import result_files as names
+from slam_graph.results.folders_written import GOES_ON
 from slam_graph.results.free_memory import give_back
 from slam_graph.results.map_output import PointMap
-from slam_graph.results.result_files import ResultFolder
-from slam_graph.results.run_files import (
-    GOES_ON,
-    begin_folder,
-    save_causal,
-    save_frames,
-    save_rigs,
-)
+from slam_graph.results.run_files import save_causal, save_frames, save_rigs
 from slam_graph.results.run_input import Ending
 from slam_graph.results.run_result import RunResult
 
@@ -33,20 +27,21 @@ def save_so_far(result: RunResult, folder: Path, wall_s: float) -> None:
         wall_s: time that the run has taken so far, s.
 
     Raises:
-        DataError: if a file cannot be written.
+        DataError: if the folder has a result of another kind, or a file cannot be written.
     """
-    ending = Ending("unfinished", GOES_ON, None, wall_s)
+    ending = Ending("unfinished", GOES_ON.format(kind="run"), None, wall_s)
     now = replace(result, ending=ending, point_map=PointMap())
     try:
-        _write(now, begin_folder(now, folder))
+        _write(now, folder)
     finally:
         del now
         give_back()
 
 
-def _write(now: RunResult, files: ResultFolder) -> None:
+def _write(now: RunResult, folder: Path) -> None:
     """The files that there are of an unfinished run."""
-    files.json(names.METRICS, now.metrics)
+    files = now.folders_written.begin(folder, "run")
+    now.folders_written.write_metrics(files, now.metrics)
     files.text(names.CONFIG, [now.config.as_yaml()])
     save_rigs(now, files)
     save_causal(now, files)

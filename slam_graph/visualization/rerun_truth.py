@@ -8,6 +8,8 @@ those of the camera, as it is its path that is known up to a scale.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -16,14 +18,12 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from slam_graph.arrays import FloatArray, IntArray
+from slam_graph.errors import DataError
 from slam_graph.evaluation import ape, synchronize
 from slam_graph.geometry import AlignmentMode, Similarity, Trajectory
 
 if TYPE_CHECKING:
     from slam_graph.visualization.rerun_outcome import FinishedRun
-
-_UNPLACED_M = 100.0
-"""σ of a position beyond which nothing is known of it."""
 
 
 def placed_truth(estimate: Trajectory, truth: Trajectory, alignment: AlignmentMode) -> Similarity:
@@ -50,6 +50,8 @@ class JudgedRun:
             axes and in units of the estimate.
         alignment: with the truth.
         breaks_ns: times between worlds of the run, each of which is aligned by itself.
+        closed: the path after loop closure, where that has joined some of the worlds.
+        closed_breaks_ns: times between those that are left.
         camera: body_T_camera, where these are the paths of a camera instead of the body.
     """
 
@@ -59,6 +61,8 @@ class JudgedRun:
     sigmas: FloatArray
     alignment: AlignmentMode
     breaks_ns: list[int]
+    closed: Trajectory | None = None
+    closed_breaks_ns: Sequence[int] = ()
     camera: gtsam.Pose3 | None = None
 
     @staticmethod
@@ -66,22 +70,31 @@ class JudgedRun:
         """Those of a run."""
         extent, sigmas, causal = run.metrics["extent"], run.sigmas[:, :6], run.trajectory
         best, camera = causal if run.smoothed is None else run.smoothed, None
+        breaks_ns = extent.get("world_breaks_ns", [])
+        left_ns = (run.metrics.get("loop_closure") or {}).get("world_breaks_ns", breaks_ns)
+        closed = None if left_ns == breaks_ns else run.loop_closed
         if extent.get("scale") == "unknown":
             camera = run.rig.cameras[0].body_T_camera
             truth, causal, best = (path.mounted(camera) for path in (truth, causal, best))
+            closed = None if closed is None else closed.mounted(camera)
             sigmas = _mounted_sigmas(sigmas, camera)
         mode = extent.get("alignment", "yaw")  # earlier runs do not say it
-        breaks_ns = extent.get("world_breaks_ns", [])
-        return JudgedRun(truth, causal, best, sigmas, mode, breaks_ns, camera)
+        return JudgedRun(truth, causal, best, sigmas, mode, breaks_ns, closed, left_ns, camera)
 
     def true_paths(self, truth: Trajectory) -> list[FloatArray]:
-        """(M, 3) the true positions of the body in each world of the run.
+        """(M, 3) the true positions of the body in each world of the run, and of the closed path.
 
         Raises:
             DataError: if truth and estimate share no time, or do not determine the maps.
         """
         onto = ape(self.truth, self.best, alignment=self.alignment, breaks_ns=self.breaks_ns)
-        return onto.alignment.undo(truth)
+        paths = onto.alignment.to_estimate(truth)
+        if self.closed is not None:
+            left_ns = self.closed_breaks_ns
+            with suppress(DataError):
+                onto = ape(self.truth, self.closed, alignment=self.alignment, breaks_ns=left_ns)
+                paths += onto.alignment.to_estimate(truth)
+        return paths
 
     def errors(self) -> tuple[IntArray, dict[str, tuple[FloatArray, FloatArray]]]:
         """Times (K,), and errors (K, 3) with standard deviations (K, 3) by the plots.
@@ -98,7 +111,7 @@ class JudgedRun:
         turned = (back * Rotation.from_quat(true.quaternions)).as_rotvec()
         metres = found.alignment.scales(own.stamps_ns)[:, None]
         if self.breaks_ns:  # they may be those of the worlds to one another
-            sigmas[np.any(sigmas[:, 3:] > _UNPLACED_M, axis=1)] = np.nan
+            sigmas[~found.alignment.placed(sigmas[:, 3:] ** 2)] = np.nan
         rows: dict[str, tuple[FloatArray, Any]] = {
             "error/position": (
                 back.apply(true.positions - own.positions),

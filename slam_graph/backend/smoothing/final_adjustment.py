@@ -76,6 +76,8 @@ class FinalBa:
             or are not known, and where the recording was adjusted in several segments.
         fixes: lever arm and clock of the position fixes, where they are variables; of the last
             segment.
+        within: (N, 6, 6) pose covariances as those of the history, but relative to position and yaw
+            of a state of the same world; None where all states are in one.
     """
 
     history: StateHistory
@@ -84,6 +86,7 @@ class FinalBa:
     noise: ImuNoiseFactors = field(default_factory=ImuNoiseFactors)
     equations: PoseEquations | None = None
     fixes: AidingData.Calibration | None = None
+    within: FloatArray | None = None
 
     @property
     def trajectory(self) -> Trajectory:
@@ -141,8 +144,9 @@ class FinalBa:
                 logger.warning("part %d of the recording is not smoothed: %s", number, error)
                 continue
             if found is not None:
+                within = found.history.pose_covariances() if len(worlds) > 1 else None
                 history = in_unknown_world(found.history, unknown)
-                parts.append(replace(found, history=history))
+                parts.append(replace(found, history=history, within=within))
         if len(parts) < 2:
             return parts[0] if parts else None
         history = parts[0].history.like()
@@ -150,7 +154,8 @@ class FinalBa:
             history.extend(found.history)
         last = parts[-1]
         summary = total_of([found.summary for found in parts])
-        return FinalBa(history, summary, None, last.noise, fixes=last.fixes)
+        own = np.concatenate([found.within for found in parts if found.within is not None])
+        return FinalBa(history, summary, None, last.noise, fixes=last.fixes, within=own)
 
 
 def adjust_recording(

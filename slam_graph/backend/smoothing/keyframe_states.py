@@ -272,11 +272,7 @@ def extended_by(earlier: list[NavState], later: Trajectory) -> Trajectory:
     history = StateHistory()
     for state in earlier:
         history.append(state)
-    parts = history.trajectory(), later
-    names = ("stamps_ns", "positions", "quaternions", "velocities", "accel_biases", "gyro_biases")
-    return Trajectory(
-        **{name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
-    )
+    return Trajectory.concatenate([history.trajectory(), later])
 
 
 def in_unknown_world(history: StateHistory, unknown: FloatArray) -> StateHistory:
