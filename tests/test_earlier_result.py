@@ -134,6 +134,16 @@ def test_a_run_that_cannot_write_its_map_keeps_that_of_the_other(
     assert load_result(tmp_path).status == "unfinished"
 
 
+def test_a_link_to_the_folder_of_objects_is_no_error(folder: Path, tmp_path: Path) -> None:
+    elsewhere = tmp_path / "elsewhere"
+    (folder / "objects" / "mine.tum").unlink()
+    (folder / "objects").rename(elsewhere)
+    (folder / "objects").symlink_to(elsewhere)
+    result_of("second").save(folder)
+    assert (folder / "objects").is_symlink()
+    assert load_result(folder).status == "ok"
+
+
 def test_files_that_are_of_no_result_stay(tmp_path: Path) -> None:
     """The folder of a recording has a ground truth, say, and other metrics."""
     for text in ("{}", "[1]", "no JSON"):

@@ -30,6 +30,7 @@ from slam_graph.errors import EstimationError
 from slam_graph.evaluation.absolute_pose_error import ape
 from slam_graph.geometry.trajectory import Trajectory
 from slam_graph.pipeline.run_recording import run
+from slam_graph.pipeline.smoothing import Smoothing
 from slam_graph.results.run_result import RunResult
 from slam_graph.sensors import FeatureFrame
 from slam_graph.sensors.camera import Camera
@@ -278,6 +279,30 @@ def test_a_minimum_that_contradicts_the_causal_estimate_does_not_go_unsaid(
     result = run(flight(2, 1.0, duration_s=4.0), min_coverage=0.1)
     assert asked == [False, True]
     assert result.warnings["smoothed_contradicts"] == still_apart
+
+
+@pytest.mark.parametrize("fault", [RuntimeError("singular"), KeyboardInterrupt()])
+def test_a_failure_of_the_second_adjustment_leaves_the_first_one_and_says_so(
+    fault: BaseException, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """After Ctrl-C, where nothing more is said, there is none."""
+    adjusted, first = FinalBa.of_worlds, list[FinalBa | None]()
+
+    def failing(*arguments: Any) -> FinalBa | None:
+        if arguments[-1]:
+            raise fault
+        first.append(adjusted(*arguments))
+        return first[-1]
+
+    monkeypatch.setattr(FinalBa, "of_worlds", failing)
+    monkeypatch.setattr(Smoothing, "_contradiction", lambda *_: (True, ["it is apart"]))
+    result = run(flight(2, 1.0, duration_s=4.0), min_coverage=0.1)
+    interrupted = isinstance(fault, KeyboardInterrupt)
+    assert result.status == ("interrupted" if interrupted else "ok")
+    assert first[0] is not None
+    assert result.final_ba is (None if interrupted else first[0])
+    assert result.warnings["final_ba_failed"] == interrupted
+    assert result.warnings["smoothed_contradicts"] > 0
 
 
 def test_what_does_not_fit_the_causal_trajectory_is_what_moves(keep: Keep) -> None:

@@ -261,6 +261,34 @@ def test_the_only_edge_between_two_sessions_is_trusted() -> None:
     assert not sessions.keep_edges(twice).is_odometry[[29, -1]].any(), "two may contradict"
 
 
+@pytest.mark.parametrize("robust", ["gnc", "dcs"])
+@pytest.mark.parametrize("count", [1, 2])
+def test_single_false_loops_do_not_outdo_the_edge_between_two_sessions(
+    robust: str, count: int
+) -> None:
+    """Nothing confirms any of them; the edge between consecutive poses is the likeliest."""
+    graph, _ = laps(2, 0.02)
+    crosses = (graph.edges < 30).any(axis=1) & (graph.edges >= 30).any(axis=1)
+    crosses[29] = False
+    keys = np.arange(60)
+    keys[30:] += 500
+    sessions = replace(graph, keys=keys).keep_edges(~crosses)
+    ends, far = np.array([[5, 52], [21, 40]])[:count], np.array([[30.0, 5.0], [-8.0, 25.0]])[:count]
+    false = Poses(np.tile(np.eye(2), (count, 1, 1)), far)
+    measured, weights = sessions.measured.concatenated(false), sessions.information
+    wrong = replace(
+        sessions,
+        edges=np.concatenate([sessions.edges, ends]),
+        measured=measured,
+        information=np.concatenate([weights, weights[:count]]),
+    )
+    assert not wrong.is_odometry[29]
+    policy = PoseGraphPolicy.model_validate({"cost": {"robust": robust}})
+    found = optimize_pose_graph(wrong, policy).weights
+    assert found[29] > 0.5
+    assert (found[len(sessions.edges) :] < 0.5).all()
+
+
 @pytest.mark.parametrize("seed", range(20))
 def test_an_edge_across_a_gap_is_odometry_if_it_alone_joins_two_parts(seed: int) -> None:
     rng = np.random.default_rng(seed)

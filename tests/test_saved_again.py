@@ -4,6 +4,7 @@
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -72,7 +73,34 @@ def test_a_result_that_is_saved_again_keeps_what_is_its_own(
     assert result.save(str(tmp_path)) == first
     result.save(tmp_path / ".." / tmp_path.name)
     assert content(tmp_path) == before
+    renamed = tmp_path.rename(tmp_path.with_name(f"{tmp_path.name} renamed"))
+    result.save(renamed)
+    assert content(renamed) == before
     assert not kept(caplog)
+
+
+def test_a_result_that_has_changed_leaves_nothing_of_what_it_was(tmp_path: Path) -> None:
+    """What is not of it stays, and so does its map."""
+    whole = graph(1)
+    less = replace(whole, covariances=None)
+    less.save(tmp_path / "alone")
+    kept = tmp_path / "kept"
+    whole.save(kept)
+    (kept / "map.slam").write_text("of somebody")
+    with interrupted_at(1), pytest.raises(KeyboardInterrupt):
+        less.save(kept)
+    less.save(kept)
+    found = content(kept)
+    assert found.pop("map.slam") == b"of somebody"
+    assert found == content(tmp_path / "alone")
+    graph(2).save(kept)
+    (kept / "covariances.csv").write_text("of somebody")
+    less.save(kept)
+    less.save(kept)
+    assert "covariances.csv" not in content(kept), "derived, of the other result"
+    (kept / "covariances.csv").write_text("of somebody")
+    less.save(kept)
+    assert (kept / "covariances.csv").read_text() == "of somebody"
 
 
 @pytest.mark.parametrize("make", KINDS.values(), ids=KINDS)

@@ -31,6 +31,8 @@ short way that is seen at all has nearly 1. An estimate that has drifted far fro
 moves has little, too, but no small spread: it is aligned as well as it can be, and its error is
 large. What moves along a line is aligned with it, though the rotation about the line is one of
 noise."""
+_MOVES_M = 1.0
+"""A reference that spreads over more (rms) moves: an estimate that stands then is wrong."""
 _RELATIVE_RANK = 1e-14
 """A correlation, or a singular value over the largest one, below this counts as zero."""
 
@@ -173,7 +175,8 @@ def _determined(
     if common <= _RELATIVE_RANK * sizes:
         return False
     spread_m = min(float(np.linalg.norm(points)) for points in in_metres) / np.sqrt(len(reference))
-    return bool(common > least * sizes or spread_m > _STANDS_M)
+    moves = float(np.linalg.norm(reference)) > _MOVES_M * np.sqrt(len(reference))
+    return bool(moves or common > least * sizes or spread_m > _STANDS_M)
 
 
 def _align_yaw(reference: FloatArray, estimate: FloatArray, least: float) -> Similarity:

@@ -27,7 +27,7 @@ _SMOOTHED = (*COMPLETED, "diverged")
 """Run statuses after which the recording is bundle adjusted (not after Ctrl-C)."""
 
 _FAILED = "no smoothed trajectory"
-_SECOND = "no second adjustment, of what fits the causal trajectory"
+_SECOND = "no second adjustment with only what fits the causal trajectory"
 _LEAST_LEFT = 0.6
 """Features that do not fit the causal trajectory are left out where this part of the observations
 is left: where less is, it may be what is wrong."""
@@ -100,15 +100,16 @@ class Smoothing(Stage):
     def _solve(self, log: backend.FrameLog) -> None:
         result = self._result
         log = log.without(self._objects.moved)
-        result.final_ba = found = self._adjusted(log)
+        found = self._adjusted(log)
         if found is None:
             return
         is_apart, causes = self._contradiction(found)
         if is_apart:
             again = self._consistent(log, found)
-            result.final_ba = found = again or found
+            found = again or found
             if again is None:
                 self._diagnostics.warn("smoothed_contradicts", "; ".join(causes))
+        result.final_ba = found  # not one that may contradict, and of which nothing is said yet
         summary = found.summary
         logger.info(
             "final bundle adjustment: %d keyframes, %d features, %d steps in %.1f s",

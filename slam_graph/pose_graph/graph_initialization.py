@@ -118,8 +118,9 @@ def factorized(matrix: csc_matrix) -> SuperLU:
 
 Initialization = Literal["chordal", "lago", "odometry", "file"]
 
-_LOOP_CLOSURE_LENGTH = 1e6
-"""Length of a loop closure in the spanning tree, where an edge of odometry has 1."""
+_LOOP_CLOSURE_LENGTH, _GAP_LENGTH = 1e6, 1e3
+"""Length of a loop closure in the spanning tree, where an edge of odometry has 1; and of one that
+joins consecutive poses, across a gap between their ids: it is seldom false."""
 
 
 def initialize(graph: PoseGraph, how: Initialization, diagnostics: Diagnostics) -> Poses:
@@ -274,7 +275,9 @@ def tree_edges(graph: PoseGraph) -> IntArray:
 def _tree(graph: PoseGraph) -> list[tuple[int, int, int]]:
     """Triples (pose, parent in the tree, edge), parents first."""
     n = len(graph.keys)
-    lengths = np.where(graph.is_odometry, 1.0, _LOOP_CLOSURE_LENGTH)
+    follows = np.abs(np.diff(graph.edges, axis=1))[:, 0] == 1
+    lengths = np.where(follows, _GAP_LENGTH, _LOOP_CLOSURE_LENGTH)
+    lengths[graph.is_odometry] = 1.0
     ends, first = np.unique(np.sort(graph.edges, axis=1), axis=0, return_index=True)
     links = coo_matrix((lengths[first], tuple(ends.T)), shape=(n, n))
     tree = minimum_spanning_tree(links.tocsr())

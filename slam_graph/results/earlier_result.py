@@ -116,15 +116,18 @@ def make_room(folder: Path) -> list[tuple[Path, Path]]:
     Files.write_text(metrics, [json.dumps(table, indent=2), "\n"])
     with Files.writing(metrics):
         os.utime(metrics, ns=(written_ns, written_ns))  # a later recording stays later
-    paths = [path for path in sorted(folder.iterdir()) if is_file_of_result(path.name)]
-    of_objects = sorted((folder / _OBJECTS).glob("*"))
+    objects = folder / _OBJECTS
+    with Files.writing(folder):
+        paths = [path for path in sorted(folder.iterdir()) if is_file_of_result(path.name)]
+    of_objects = sorted(objects.glob("*"))
     paths += [path for path in of_objects if is_file_of_result(f"{_OBJECTS}/{path.name}")]
     for path in [folder / names.TRAJECTORY, *paths]:
         with Files.writing(path):
             if path.name != names.MAP_NAME and (path.is_file() or path.is_symlink()):
                 path.unlink()
-    if (folder / _OBJECTS).is_dir() and not any((folder / _OBJECTS).iterdir()):
-        (folder / _OBJECTS).rmdir()
+    with Files.writing(objects):
+        if objects.is_dir() and not objects.is_symlink() and not any(objects.iterdir()):
+            objects.rmdir()
     recording, kept = folder / _RECORDING, [folder / names.MAP_NAME]
     if recording.is_file() and recording.stat().st_mtime_ns <= written_ns:
         kept.append(recording)  # a later one is of the run that is to be saved

@@ -28,17 +28,18 @@ class FoldersWritten:
     """Folders that have the files of one result.
 
     A folder is no longer that of the result when another one was saved there meanwhile, as its
-    `metrics.json` tells: that file is another one then.
+    `metrics.json` tells: that file is another one then. A folder that was renamed still is.
     """
 
     def __init__(self) -> None:
-        self._metrics: dict[Path, tuple[int, int]] = {}
+        self._metrics: dict[Path, tuple[int, int] | None] = {}
         self._set_aside: dict[Path, list[tuple[Path, Path]]] = {}
+        self._names: dict[Path, set[str]] = {}
 
     def __contains__(self, folder: Path) -> bool:
         """Whether the result that a folder has now is this one."""
-        known = self._metrics.get(folder.resolve())
-        return known is not None and known == _identity(folder)
+        found = _identity(folder)
+        return found is not None and found in self._metrics.values()
 
     def begin(self, folder: Path, kind: Kind) -> ResultFolder:
         """The folder of the result, without files of another one; its own stay.
@@ -53,6 +54,7 @@ class FoldersWritten:
         """
         if folder not in self:
             refuse_other_kind(folder, kind)
+            self._names.pop(folder.resolve(), None)
             self._set_aside.setdefault(folder.resolve(), []).extend(make_room(folder))
         return ResultFolder(folder)
 
@@ -67,6 +69,8 @@ class FoldersWritten:
     ) -> Iterator[ResultFolder]:
         """The folder of the result; the block writes all files but `metrics.json`, which is last.
 
+        What the result wrote there before, and has no more, is removed; but a map is kept.
+
         Args:
             folder: made if it is missing.
             kind: of the result.
@@ -75,14 +79,25 @@ class FoldersWritten:
         Raises:
             DataError: as `begin`, or if a file cannot be written.
         """
+        files = None
         try:
             files = self.begin(folder, kind)
             status = {"status": "unfinished", "message": GOES_ON.format(kind=kind)}
             self.write_metrics(ResultFolder(folder), {**metrics, **status})
             yield files
+            self._remove_older(files)
             self.write_metrics(files, metrics)
         finally:
+            if files is not None:
+                self._names.setdefault(folder.resolve(), set()).update(_names_of(files))
             self._settle(folder)
+
+    def _remove_older(self, files: ResultFolder) -> None:
+        """Remove what the result wrote into the folder before, and has not written now."""
+        older = self._names.pop(files.folder.resolve(), set())
+        for name in sorted(older - _names_of(files) - {names.METRICS, names.MAP_NAME}):
+            with Files.writing(files.folder / name):
+                (files.folder / name).unlink(missing_ok=True)
 
     def _settle(self, folder: Path) -> None:
         """Say what was set aside, and remove that in whose place a new file was written."""
@@ -94,10 +109,15 @@ class FoldersWritten:
                 logger.warning("%s: of an earlier result, kept as %s", old, other.name)
 
 
-def _identity(folder: Path) -> tuple[int, int]:
-    """What tells one `metrics.json` from another: its number and its time in ns."""
+def _names_of(files: ResultFolder) -> set[str]:
+    """Names of the files that were written, relative to their folder."""
+    return {path.relative_to(files.folder).as_posix() for path in files.files}
+
+
+def _identity(folder: Path) -> tuple[int, int] | None:
+    """What tells one `metrics.json` from another: its number and its time in ns; None without."""
     try:
         found = (folder / names.METRICS).stat()
     except OSError:
-        return 0, 0
+        return None
     return found.st_ino, found.st_mtime_ns
