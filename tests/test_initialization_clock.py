@@ -226,7 +226,7 @@ def test_an_unknown_offset_is_found_in_the_start(offset_s: float, cameras: int) 
 @pytest.mark.parametrize("known", [True, False])
 def test_features_that_are_known_to_move_do_not_bend_the_clock(known: bool) -> None:
     """Most features are on a body that turns as the world would under a clock 50 ms off."""
-    static = np.arange(300)
+    static = np.arange(120)
     check, imu, found = StartCalibration(rig(1), BackendConfig()), ImuBuffer(), []
     for before, packet in pairwise(recorded(0.0, 1, 6.0, points=1500)):
         assert isinstance(packet.frame, FeatureFrame)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from slam_graph.arrays import FloatArray
 from slam_graph.kernels.ascending import are_among, are_among_numpy
 from slam_graph.kernels.chained_turns import chain_turns, chain_turns_numpy
 from slam_graph.kernels.elimination import (
@@ -22,6 +23,7 @@ from slam_graph.kernels.epipolar import (
     sampson_distances,
     sampson_distances_numpy,
 )
+from slam_graph.kernels.epipolar_equations import CAUCHY_WIDTH, pair_equations, pair_equations_numpy
 from slam_graph.kernels.epipolar_pairs import (
     epipolar_distances,
     epipolar_distances_numpy,
@@ -437,6 +439,41 @@ def test_refine_rotation(count: int, wrong: int, parallax: float) -> None:
     assert all(same(a, b, 1e-9) for a, b in zip(others, other_form, strict=True))
     error = Rotation.from_matrix(turn.T @ R).as_rotvec()
     assert wrong > 0 or error @ others[0] @ error < 16.3  # χ² of three, p = 0.001
+
+
+def test_pair_equations() -> None:
+    """The gradient is that of the cost with the best directions, as far as weights are constant."""
+    rng = np.random.default_rng(11)
+    pairs, R = [], np.empty((3, 3, 3))
+    for p, count in enumerate((15, 60, 33)):
+        turn, away = (Rotation.from_rotvec(rng.normal(0.0, s, 3)) for s in (0.2, 1e-3))
+        points = rng.uniform([-2.0, -2.0, 2.0], [2.0, 2.0, 8.0], (count, 3))
+        both = points, (points - [0.3, 0.0, 0.0]) @ turn.as_matrix()
+        rays = [f / np.linalg.norm(f, axis=1, keepdims=True) for f in both]
+        pairs.append([f + rng.normal(0.0, 1e-3, f.shape) for f in rays])
+        R[p] = (turn * away).as_matrix()
+    first, second = (np.concatenate(seen) for seen in zip(*pairs, strict=True))
+    variances = (1e-3 * rng.uniform(0.5, 1.5, (len(first), 2))) ** 2
+    begins = np.array([0, 15, 75, 108])
+
+    def filled(form: Callable[..., None], R: FloatArray) -> tuple[FloatArray, ...]:
+        t, found = np.tile([0.96, 0.28, 0.0], (3, 1)), np.empty((3, 3, 4))
+        squares = np.empty(len(first))
+        for _ in range(4):  # a direction that is far off takes some steps more
+            form(first, second, variances, begins, np.ascontiguousarray(R), t, found, squares)
+        return found, t, squares
+
+    def costs(R: FloatArray) -> FloatArray:
+        squares = filled(pair_equations, R)[2]
+        return np.add.reduceat(0.5 * CAUCHY_WIDTH**2 * np.log1p(squares), begins[:-1])
+
+    both_forms = zip(filled(pair_equations, R), filled(pair_equations_numpy, R), strict=True)
+    assert all(same(ours, other) for ours, other in both_forms)
+    gradients = filled(pair_equations, R)[0][:, :, 3]
+    for k in range(3):
+        step = Rotation.from_rotvec(1e-6 * np.eye(3)[k]).as_matrix()
+        numerical = (costs(R @ step) - costs(R @ step.T)) / 2e-6
+        np.testing.assert_allclose(gradients[:, k], numerical, atol=0.05 * np.abs(gradients).max())
 
 
 @pytest.mark.parametrize("form", [refine_rotation, refine_rotation_numpy])

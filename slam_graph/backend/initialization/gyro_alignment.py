@@ -105,7 +105,7 @@ class GyroAlignment:
         return self.margin >= margin and self.misfit <= _MAX_MISFIT
 
 
-class _Gyroscope:
+class IntegratedGyroscope:
     """The integrated gyroscope, at any time."""
 
     def __init__(self, imu: ImuData) -> None:
@@ -119,10 +119,13 @@ class _Gyroscope:
     def orientation(self, t: FloatArray) -> FloatArray:
         """start_R_body (..., 3, 3) at times (...) in seconds after the start."""
         row = np.clip(np.searchsorted(self._t, t, side="right") - 1, 0, len(self._t) - 1)
-        rate = np.stack([np.interp(t, self._t, axis) for axis in self._rate.T], axis=-1)
-        turn = 0.5 * (self._rate[row] + rate) * (t - self._t[row])[..., None]
+        turn = 0.5 * (self._rate[row] + self.rate(t)) * (t - self._t[row])[..., None]
         step = Rotation.from_rotvec(turn.reshape(-1, 3)).as_matrix().reshape(*t.shape, 3, 3)
         return np.asarray(self._R[row] @ step)
+
+    def rate(self, t: FloatArray) -> FloatArray:
+        """Angular rates (..., 3) at times (...) in seconds after the start."""
+        return np.stack([np.interp(t, self._t, axis) for axis in self._rate.T], axis=-1)
 
 
 class _Problem:
@@ -134,7 +137,7 @@ class _Problem:
     """
 
     def __init__(self, turns: Turns, imu: ImuData) -> None:
-        self._gyro = _Gyroscope(imu)
+        self._gyro = IntegratedGyroscope(imu)
         self._t = 1e-9 * (np.stack([turns.first_ns, turns.second_ns]) - self._gyro.start_ns)
         self._seconds = self._t[1] - self._t[0]
         self._turns = turns

@@ -20,6 +20,7 @@ from slam_graph.arrays import IntArray
 from slam_graph.backend.backend_config import BackendConfig, CalibrationConfig
 from slam_graph.backend.initialization.clock_change import ClockChange
 from slam_graph.backend.initialization.clock_monitor import ClockMonitor
+from slam_graph.backend.initialization.epipolar_alignment import align_by_epipolar_errors
 from slam_graph.backend.initialization.gyro_alignment import (
     CLEAR,
     GyroAlignment,
@@ -33,6 +34,8 @@ _SPACING_NS, _LATER_SPACING_NS = 45_000_000, 360_000_000
 """Smallest time between two frames that are used, at the start and later."""
 _LATER_TURNS = 10
 """Fewest rotations for a test of the clock later."""
+_REFINED_NS = 900_000_000
+"""Time between two estimates by epipolar errors, which take longer."""
 _RETRY_NS, _LATER_RETRY_NS = 400_000_000, 900_000_000
 """Time between two estimates at the start, and between two tests of the clock later."""
 _LATER_PAUSE_NS, _LONGEST_PAUSE_NS = 5_000_000_000, 60_000_000_000
@@ -97,6 +100,7 @@ class StartCalibration:
         self._turns = VisualTurns(self._camera, config.noise.pixel_sigma)
         self._pause_ns = _LATER_PAUSE_NS
         self._next_ns: int | None = None  # of the next comparison; None: at once
+        self._refined_ns = np.iinfo(np.int64).min // 2
         self._doubted_ns: int | None = None  # since when the clock seems to have changed
         self._checks = config.initialization.check_calibration
         self._monitor = ClockMonitor(self._camera) if self.mounted else None
@@ -147,7 +151,10 @@ class StartCalibration:
             return None
         R = self._camera.body_T_camera.rotation().matrix() if self.mounted else None
         found = align_gyroscope(*covered, R, self._camera.clock_offset_s)
-        if found is None or not found.is_clear(CLEAR if started else _CLEAR_WAITING):
+        margin = CLEAR if started else _CLEAR_WAITING
+        if found is None or not (found.is_clear(margin) and self._fits(found)):
+            found = self._refined(found, margin, frame, imu)
+        if found is None or not found.is_clear(margin):
             return None
         change = None if monitor is None else monitor.compare(found, covered, imu)
         if change is not None:
@@ -159,6 +166,25 @@ class StartCalibration:
             if started or frame.stamp_ns - self._doubted_ns < _WAIT_NS:
                 return None
         return self._judged(found, _ADOPTED_SIGMA_S if started else _WAITING_SIGMA_S)
+
+    def _refined(
+        self, coarse: GyroAlignment | None, margin: float, frame: FeatureFrame, imu: ImuBuffer
+    ) -> GyroAlignment | None:
+        """By epipolar errors, once a second, what rotations of two views do not show as well."""
+        if frame.stamp_ns < self._refined_ns + _REFINED_NS:
+            return None
+        self._refined_ns = frame.stamp_ns
+        seen = self._static, self._camera, self._config.noise.pixel_sigma
+        found = align_by_epipolar_errors(*seen, imu, coarse, self.mounted)
+        if found is None or coarse is None or not coarse.is_clear(margin):
+            return found
+        return min(found, coarse, key=_uncertainty)
+
+    def _fits(self, found: GyroAlignment) -> bool:
+        """Whether the calibrated offset is known to fit."""
+        sigma_s = found.offset_sigma_s
+        difference_s = abs(found.offset_s - self._camera.clock_offset_s)
+        return self.mounted and difference_s < _FITS_SIGMAS * sigma_s and sigma_s < _FITS_SIGMA_S
 
     def _waits(self, frame: FeatureFrame) -> bool:
         """Whether the next comparison is later than a frame."""
@@ -214,7 +240,7 @@ class StartCalibration:
         if not self.mounted:
             known = sigma_s < largest_sigma_s and found.rotation_sigma_rad < _ROTATION_SIGMA_RAD
             return self._adopted(found) if known else None
-        if difference_s < _FITS_SIGMAS * sigma_s and sigma_s < _FITS_SIGMA_S:
+        if self._fits(found):
             self.done = True
             return None
         least_s = _ADOPTED_S
@@ -262,3 +288,7 @@ class StartCalibration:
         self._monitor = ClockMonitor(self._camera, (found.offset_s, found.offset_sigma_s))
         variables = CalibrationConfig(**{**self._config.calibration.model_dump(), **changes})
         return FoundCalibration(replace(self._rig, cameras=tuple(cameras)), variables, message)
+
+
+def _uncertainty(found: GyroAlignment) -> tuple[float, float]:
+    return found.rotation_sigma_rad, found.offset_sigma_s

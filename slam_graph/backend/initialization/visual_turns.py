@@ -72,28 +72,9 @@ class VisualTurns:
                 other frame: where the spacing is nearly as long as that.
         """
         if not self._frames or frame.stamp_ns - self._frames[-1][0] >= spacing_ns:
-            seen = (self._unrolled(frame, imu) if mounted else frame).cameras[0]
+            seen = (at_middle_row(frame, self._camera, imu) if mounted else frame).cameras[0]
             bearings = Bearings.of(seen, self._camera.camera, self._pixel_sigma)
             self._add(frame.stamp_ns, bearings, keep_last)
-
-    def _unrolled(self, frame: FeatureFrame, imu: ImuBuffer) -> FeatureFrame:
-        """The frame with the first camera's bearings at the time of its middle row."""
-        camera, seen = self._camera, frame.cameras[0]
-        if camera.readout_s == 0.0 or len(seen) == 0:
-            return frame
-        around_ns = round(0.5e9 * max(abs(camera.readout_s), _SHORTEST_TREND_S))
-        stamp_ns = frame.stamp_ns + round(camera.clock_offset_s * 1e9)
-        if not imu.covers(stamp_ns - around_ns):
-            return frame
-        rate, slope, _ = imu.trend(stamp_ns, around_ns)
-        seconds = (camera.row_times_s(seen.pixels[:, 1]) - camera.middle_s)[:, None]
-        turn = rate * seconds + 0.5 * slope * seconds**2
-        in_camera = turn @ camera.body_T_camera.rotation().matrix()
-        rays = np.column_stack([seen.normalized, np.ones(len(seen))])
-        rays = Rotation.from_rotvec(in_camera).apply(rays)
-        normalized = rays[:, :2] / np.maximum(rays[:, 2:], 1e-3)
-        turned = replace(seen, normalized=normalized)
-        return FeatureFrame(frame.stamp_ns, (turned, *frame.cameras[1:]))
 
     def _add(self, stamp_ns: int, now: Bearings, keep_last: bool) -> None:
         """The rotation since the oldest frame with enough of the same features."""
@@ -147,3 +128,29 @@ class VisualTurns:
         )
         first_ns, last_ns = rows[0][0] + nominal_ns, int(turns.second_ns.max()) + nominal_ns
         return turns, imu.between(first_ns - around_ns, last_ns + around_ns)
+
+
+def at_middle_row(frame: FeatureFrame, camera: RigCamera, imu: ImuBuffer) -> FeatureFrame:
+    """A frame with the bearings of the first camera at the time of its middle row.
+
+    Args:
+        frame: its features.
+        camera: the first of the rig.
+        imu: samples so far.
+    """
+    seen = frame.cameras[0]
+    if camera.readout_s == 0.0 or len(seen) == 0:
+        return frame
+    around_ns = round(0.5e9 * max(abs(camera.readout_s), _SHORTEST_TREND_S))
+    stamp_ns = frame.stamp_ns + round(camera.clock_offset_s * 1e9)
+    if not imu.covers(stamp_ns - around_ns):
+        return frame
+    rate, slope, _ = imu.trend(stamp_ns, around_ns)
+    seconds = (camera.row_times_s(seen.pixels[:, 1]) - camera.middle_s)[:, None]
+    turn = rate * seconds + 0.5 * slope * seconds**2
+    in_camera = turn @ camera.body_T_camera.rotation().matrix()
+    rays = np.column_stack([seen.normalized, np.ones(len(seen))])
+    rays = Rotation.from_rotvec(in_camera).apply(rays)
+    normalized = rays[:, :2] / np.maximum(rays[:, 2:], 1e-3)
+    turned = replace(seen, normalized=normalized)
+    return FeatureFrame(frame.stamp_ns, (turned, *frame.cameras[1:]))
