@@ -203,10 +203,17 @@ class _Problem:
         return np.asarray(1.0 / ((1.0 + squares / np.repeat(units, self._sizes)) * variance))
 
     def minimized(
-        self, at: _Guess, columns: list[int], steps: int = _STEPS
+        self, at: _Guess, columns: list[int], steps: int = _STEPS, t: FloatArray | None = None
     ) -> tuple[_Guess, _Equations]:
-        """The least cost by some of the unknowns, and where it is (Levenberg-Marquardt)."""
-        now, damping = self.equations(at), 1e-4
+        """The least cost by some of the unknowns, and where it is (Levenberg-Marquardt).
+
+        Args:
+            at: where to begin.
+            columns: of the unknowns.
+            steps: most steps.
+            t: as for `equations`.
+        """
+        now, damping = self.equations(at, t), 1e-4
         for _ in range(steps):
             H, g = now.H[np.ix_(columns, columns)], now.g[columns]
             better = None
@@ -333,10 +340,8 @@ def _with_curvature(
 ) -> GyroAlignment | None:
     """The alignment by a parabola through the costs around a minimum."""
     away = _FINE_S * np.arange(-_FINE_STEPS, _FINE_STEPS + 1)
-    costs = [
-        problem.minimized(replace(found, offset_s=found.offset_s + s), columns, 1)[1].cost
-        for s in away
-    ]
+    beside = [replace(found, offset_s=found.offset_s + s) for s in away]
+    costs = [problem.minimized(guess, columns, 1, least.t)[1].cost for guess in beside]
     curve = np.polyfit(away, costs, 2)
     if curve[0] <= 0.0:
         return None

@@ -34,7 +34,7 @@ _SPACING_NS, _LATER_SPACING_NS = 45_000_000, 360_000_000
 """Smallest time between two frames that are used, at the start and later."""
 _LATER_TURNS = 10
 """Fewest rotations for a test of the clock later."""
-_REFINED_NS = 900_000_000
+_REFINED_NS = 1_300_000_000
 """Time between two estimates by epipolar errors, which take longer."""
 _RETRY_NS, _LATER_RETRY_NS = 400_000_000, 900_000_000
 """Time between two estimates at the start, and between two tests of the clock later."""
