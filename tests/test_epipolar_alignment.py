@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import gtsam
 import numpy as np
@@ -22,7 +23,7 @@ from slam_graph.config import load_config
 from slam_graph.datasets.calibration.kalibr_calibration import write_kalibr
 from slam_graph.evaluation import ape
 from slam_graph.geometry import NavState, StateHistory
-from slam_graph.sensors import FeatureFrame, ImuBuffer
+from slam_graph.sensors import FeatureFrame, ImuBuffer, RigCamera
 from slam_graph.sensors.camera import Camera
 from slam_graph.simulation import simulate
 from slam_graph.simulation.simulated_sequence import SimulatedSequence
@@ -75,31 +76,85 @@ def test_a_mounting_is_found_wherever_it_is_sought_from() -> None:
     assert angle(*found) < np.deg2rad(0.2)
 
 
+def test_rows_do_not_move_by_a_mounting_that_is_unknown() -> None:
+    frames, imu = seen(0.0)
+    coarse, found = GyroAlignment(0.0, 0.01, 5.0, np.zeros(3), turned(3.0), 0.2, 100.0), []
+    for pose in (rig().cameras[0].body_T_camera, gtsam.Pose3()):
+        camera = replace(rig().cameras[0], body_T_camera=pose, readout_s=0.03)
+        one = align_by_epipolar_errors(frames, camera, 1.0, imu, coarse, mounted=False)
+        assert one is not None
+        found.append(one)
+    assert found[0].offset_s == found[1].offset_s
+    np.testing.assert_array_equal(found[0].body_R_camera, found[1].body_R_camera)
+
+
+def test_a_bearing_far_beyond_the_image_is_one_of_many() -> None:
+    """There the slopes of a lens model are huge, so that it seems to be known beyond doubt."""
+    frames, imu = seen(0.0)
+    bent = []
+    for frame in frames:
+        normalized = frame.cameras[0].normalized.copy()
+        normalized[0] = 1e9
+        one = replace(frame.cameras[0], normalized=normalized)
+        bent.append(FeatureFrame(frame.stamp_ns, (one,)))
+    found = align_by_epipolar_errors(bent, rig().cameras[0], 1.0, imu, None, mounted=True)
+    assert found is not None
+    assert abs(found.offset_s) < 2.0 * found.offset_sigma_s < 0.02
+
+
 def test_few_frames_say_nothing() -> None:
     frames, imu = seen(0.0, 1.0)
     assert align_by_epipolar_errors(frames, rig().cameras[0], 1.0, imu, None, True) is None
 
 
-def phone(data: Path, folder: Path, offset_s: float) -> SimulatedSequence:
-    """A narrow lens in the hand, with tracks of one pixel, of which 1 % are wrong."""
-    path = str(data / "tumvi_inertial" / "room1")
+def phone(
+    data: Path, folder: Path, offset_s: float, room: str = "room1", **options: Any
+) -> SimulatedSequence:
+    """A narrow lens in the hand; 1 % of the observations are wrong."""
+    path = str(data / "tumvi_inertial" / room)
     base = simulate(trajectory=path, duration_s=0.5, cameras=1, real_imu=True).rig
     lens = Camera(502.0, 502.0, 320.0, 240.0, "none", (), 640, 480)
-    camera = replace(base.cameras[0], camera=lens, time_offset_s=offset_s)
+    readout_s = options.pop("readout_s", 0.0)
+    camera = replace(
+        base.cameras[0],
+        camera=lens,
+        time_offset_s=offset_s,
+        rolling_shutter=readout_s > 0.0,
+        readout_s=readout_s,
+    )
     write_kalibr(replace(base, cameras=(camera,)), folder / "phone.yaml")
+    settings = {"start_s": 10.0, "duration_s": 8.0, "seed": 1, "rate_hz": 25.0} | options
     sequence = simulate(
         trajectory=path,
         calibration=folder / "phone.yaml",
-        start_s=10.0,
-        duration_s=8.0,
-        rate_hz=25.0,
-        seed=1,
-        tracks={"features": 100, "outliers": 0.01},
+        tracks={"features": 100, "outliers": 0.01, "pixel_sigma": settings.pop("sigma", 1.0)},
         cameras=1,
         real_imu=True,
+        **settings,
     )
     assert isinstance(sequence, SimulatedSequence)
     return sequence
+
+
+def flown(sequence: SimulatedSequence, camera: RigCamera) -> tuple[Estimator, list[NavState]]:
+    """The estimator at the end under a calibration, and the states that are left."""
+    algorithm = load_config(algorithm="msckf").algorithm
+    estimator = Estimator(replace(sequence.rig, cameras=(camera,)), algorithm, BackendConfig())
+    states: list[NavState] = []
+    for packet in sequence.packets():
+        assert isinstance(packet.frame, FeatureFrame)
+        estimator.add_imu(packet.imu)
+        estimator.add_frame(packet.frame)
+        states = (states if estimator.replayed is None else []) + estimator.states
+    return estimator, states
+
+
+def error_m(sequence: SimulatedSequence, states: list[NavState]) -> float:
+    history = StateHistory()
+    for state in states:
+        history.append(state)
+    found = ape(sequence.groundtruth(), history.trajectory(), alignment="yaw")
+    return float(found.statistics.rmse)
 
 
 @pytest.mark.parametrize("known", [True, slow(False)])
@@ -110,18 +165,18 @@ def test_a_narrow_lens_with_another_clock_starts_in_the_hand(
     sequence = phone(data_dir, tmp_path, 0.038)
     camera = replace(sequence.rig.cameras[0], time_offset_s=0.0, rotation_known=known)
     camera = camera if known else replace(camera, body_T_camera=gtsam.Pose3())
-    algorithm = load_config(algorithm="msckf").algorithm
-    estimator = Estimator(replace(sequence.rig, cameras=(camera,)), algorithm, BackendConfig())
-    states: list[NavState] = []
-    for packet in sequence.packets():
-        assert isinstance(packet.frame, FeatureFrame)
-        estimator.add_imu(packet.imu)
-        estimator.add_frame(packet.frame)
-        states = (states if estimator.replayed is None else []) + estimator.states
+    estimator, states = flown(sequence, camera)
     assert estimator.calibration is not None
     assert abs(estimator.calibration.rig.cameras[0].time_offset_s - 0.038) < 1e-3
-    history = StateHistory()
-    for state in states:
-        history.append(state)
     assert states[0].stamp_ns - sequence.info().start_ns < 4_000_000_000
-    assert ape(sequence.groundtruth(), history.trajectory(), alignment="yaw").statistics.rmse < 0.03
+    assert error_m(sequence, states) < 0.03
+
+
+def test_a_right_start_is_not_corrected_by_a_wrong_minimum(data_dir: Path, tmp_path: Path) -> None:
+    """What follows the start, solved from nothing, fits 123 of 179 features, 0.9 m/s off."""
+    options = {"start_s": 60.0, "duration_s": 6.0, "seed": 106, "sigma": 0.5}
+    options["readout_s"] = 0.02
+    sequence = phone(data_dir, tmp_path, 0.0, "room3", **options)
+    estimator, states = flown(sequence, sequence.rig.cameras[0])
+    assert "start_corrected" not in estimator.diagnostics.counts
+    assert error_m(sequence, states) < 0.03

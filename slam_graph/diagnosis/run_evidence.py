@@ -103,10 +103,10 @@ class Evidence:
     @property
     def causes(self) -> list[str]:
         """What is beyond its limit and the likeliest cause, in words."""
-        causes = []
-        if (self.noise_at_limit or 0.0) > USUAL_NOISE_AT_LIMIT:
+        causes, share = [], self.noise_at_limit
+        if share is not None and share > USUAL_NOISE_AT_LIMIT:
             causes.append(
-                f"images contradict the IMU in {self.noise_at_limit:.0%} of the frames, as with a "
+                f"images contradict the IMU in {share:.0%} of the frames, as with a "
                 "wrong calibration, clock or noise of the IMU"
             )
         if not self.agrees:

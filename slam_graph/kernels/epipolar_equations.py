@@ -21,8 +21,8 @@ __all__ = ["CAUCHY_WIDTH", "pair_equations", "pair_equations_numpy"]
 
 CAUCHY_WIDTH = 2.4
 """Residual with half the weight, in units of the noise."""
-_WIDER = np.array([1.0, 1.0])
-"""Factors on that width in the steps of the direction: wrong matches lose weight one by one."""
+_STEPS = 2
+"""Gauss-Newton steps of the direction."""
 _WEAK = 1e-3
 """Information on the direction that is added: without parallax there is none."""
 _TINY = 1e-24
@@ -47,7 +47,6 @@ def _sum_up(
     R: FloatArray,
     t: FloatArray,
     across: FloatArray,
-    width: float,
     H: FloatArray,
     squares: FloatArray,
 ) -> None:
@@ -69,7 +68,7 @@ def _sum_up(
         variance = variances[n, 0] * (1.0 - of_first * of_first)
         variance = max(variance + variances[n, 1] * (1.0 - of_second * of_second), _TINY)
         squares[n] = e * e / (CAUCHY_WIDTH * CAUCHY_WIDTH * variance)
-        weight = 1.0 / ((1.0 + squares[n] / (width * width)) * variance)
+        weight = 1.0 / ((1.0 + squares[n]) * variance)
         for i in range(3):  # Rᵀ (t × f₁)
             back[i] = 0.0
             for k in range(3):
@@ -123,13 +122,11 @@ def pair_equations(
     for p in range(len(R)):
         rows = slice(begins[p], begins[p + 1])
         one, two, noises, of_pair = first[rows], second[rows], variances[rows], squares[rows]
-        for step in range(len(_WIDER) + 1):
-            last = step == len(_WIDER)
-            width = 1.0 if last else _WIDER[step]
+        for step in range(_STEPS + 1):
             _set_across(t[p], across)
-            _sum_up(one, two, noises, R[p], t[p], across, width, H, of_pair)
+            _sum_up(one, two, noises, R[p], t[p], across, H, of_pair)
             determinant = H[3, 3] * H[4, 4] - H[3, 4] * H[4, 3]
-            if last:
+            if step == _STEPS:
                 for i in range(3):
                     a = (H[4, 4] * H[i, 3] - H[4, 3] * H[i, 4]) / determinant
                     b = (H[3, 3] * H[i, 4] - H[3, 4] * H[i, 3]) / determinant
@@ -161,11 +158,11 @@ def pair_equations_numpy(
     for p in range(len(R)):
         rows = slice(int(begins[p]), int(begins[p + 1]))
         seen = first[rows], second[rows], variances[rows], R[p]
-        for width in _WIDER:
-            H, across, _ = _sums(*seen, t[p], float(width))
+        for _ in range(_STEPS):
+            H, across, _ = _sums(*seen, t[p])
             t[p] -= np.linalg.solve(H[3:, 3:5], H[3:, 5]) @ across
             t[p] /= np.linalg.norm(t[p])
-        H, _, squares[rows] = _sums(*seen, t[p], 1.0)
+        H, _, squares[rows] = _sums(*seen, t[p])
         equations[p] = (H[:3] - H[:3, 3:5] @ np.linalg.solve(H[3:, 3:5], H[3:]))[:, [0, 1, 2, 5]]
 
 
@@ -175,7 +172,6 @@ def _sums(
     variances: FloatArray,
     R: FloatArray,
     t: FloatArray,
-    width: float,
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """H (5, 6), two unit vectors (2, 3) across t, and squares (N,) of a pair."""
     sign, scale = math.copysign(1.0, t[0]), 1.0 / (1.0 + abs(t[0]))
@@ -185,7 +181,7 @@ def _sums(
     sines = 1.0 - np.column_stack([turned @ t, first @ t]) ** 2
     variance = np.maximum(np.sum(variances * sines, axis=1), _TINY)
     squares = e**2 / (CAUCHY_WIDTH**2 * variance)
-    weights = 1.0 / ((1.0 + squares / width**2) * variance)
+    weights = 1.0 / ((1.0 + squares) * variance)
     by_turn = np.cross(second, np.cross(t, first) @ R)
     J = np.column_stack([by_turn, normals @ across.T])
     H = J.T @ (np.column_stack([J, e]) * weights[:, None])

@@ -92,8 +92,7 @@ class DynamicRefinement:
 
     Attributes:
         outliers: ids (N,) of the features that did not fit the last solution, ascending.
-        scale_sigma: relative standard deviation of the scale of the last solution; infinite if the
-            last attempt did not come so far.
+        scale_sigma: of the last solution, relative; infinite if the last attempt had none.
     """
 
     def __init__(
@@ -115,6 +114,7 @@ class DynamicRefinement:
         """
         self.outliers = np.zeros(0, np.int64)
         self.scale_sigma = float("inf")
+        self._fitness = 0, float("inf")  # features that fit the last solution, and its cost
         self._context, self._white_noise_factor = context, white_noise_factor
         self._max_scale_sigma, self._hopeless_factor = max_scale_sigma, hopeless
         self._patient, self._steps = patient, _PATIENT if patient else _BATCH
@@ -127,15 +127,14 @@ class DynamicRefinement:
         Args:
             frames: what they observed.
             guess: their states, and which features are static.
-            first: the first of these states with its covariance, if it is known. The window is in
-                its world then; else in one that the last frame defines.
+            first: the first of these states with its covariance, if it is known: the window is in
+                its world then, else in one that the last frame defines.
         """
         lasting, self.scale_sigma = _lasting(frames), float("inf")
         try:
             cost = self._batch_cost(frames, guess, lasting, first)
             linear = cost.linearize(summed=True)
-            hopeless = self._hopeless(cost, linear, len(guess.static))
-            if hopeless is not None:
+            if hopeless := self._hopeless(cost, linear, len(guess.static)):
                 return hopeless
             hopeful = None if self._patient else self._hope(cost)
             found = minimize(cost, self._steps, linear, hopeful=hopeful)
@@ -154,11 +153,9 @@ class DynamicRefinement:
         except np.linalg.LinAlgError:
             return Refusal("motion", "motion that determines gravity and scale")
         last, calibration = len(frames.frames) - 1, self._context.calibration.keys
-        keep = [L(j) for j in features.tolist()]
-        keep += [*calibration, *imu_state_keys(last)]
-        points: LinearizationPoints = "current"
-        if self._context.algorithm.marginalization.first_estimates:
-            points = "first"
+        keep = [*(L(j) for j in features.tolist()), *calibration, *imu_state_keys(last)]
+        policy = self._context.algorithm.marginalization
+        points: LinearizationPoints = "first" if policy.first_estimates else "current"
         prior = marginalize(posterior, cost.state, keep, points)
         if first is None:
             prior = self._in_gauge(prior, cost.state, last, features)
@@ -170,7 +167,12 @@ class DynamicRefinement:
             state_features=features,
             calibration=calibration,
         )
-        return self._doubt(_normalized_cost(cost, linear), start) or start
+        self._fitness = fit, _normalized_cost(cost, linear)
+        return self._doubt(self._fitness[1], start) or start
+
+    def fits_better_than(self, other: DynamicRefinement) -> bool:
+        """Whether the last solution fits more features than that of another, and no worse."""
+        return self._fitness[0] >= other._fitness[0] and self._fitness[1] <= other._fitness[1]
 
     def _hopeless(self, cost: BatchCost, linear: Linearization, static: int) -> Refusal | None:
         """What is missing if the guess already shows that no start will come of it.

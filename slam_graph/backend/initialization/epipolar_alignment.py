@@ -19,6 +19,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
+import gtsam
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -42,12 +43,15 @@ _COARSE_S, _FINE_S, _FINE_STEPS = 0.02, 5e-3, 3
 """Steps of the time offset, and how many of the smaller ones on either side."""
 _BIAS_SIGMA, _OFFSET_SIGMA_S, _TURN_SIGMA = 0.1, 0.5, 10.0
 """Prior standard deviations: rad/s, s, rad."""
+_LEAST_SIGMA_RAD = 1e-6
+"""Of a bearing: where a lens model is used far beyond its image its slopes have no limit."""
 _GYROSCOPE_RAD = 1.5e-3
 """Standard deviation of the rotation of a pair by the gyroscope (measured on recorded flights)."""
 _CORRELATION, _TURN_CORRELATION = 2.0, 3.0
 """Pairs share frames and errors: standard deviations of offset and mounting are larger by this."""
-_LEAST_VARIANCE = 0.05
-"""Of the residuals, in units of what is assumed."""
+_LEAST_VARIANCE = 0.25
+"""Of the residuals, in units of what is assumed: with less noise the errors that are left are those
+of the gyroscope and of the calibration, as of a mounting that is some degrees off."""
 _MEDIAN_CHI2_1 = 0.455
 """Median of χ² with one degree of freedom."""
 _REWEIGHTINGS = 3
@@ -117,7 +121,7 @@ class _Problem:
             np.column_stack([frames[a][1].sigmas[i], frames[b][1].sigmas[j]])
             for a, b, i, j in pairs
         ]
-        self._variances = np.concatenate(sigmas) ** 2
+        self._variances = np.maximum(np.concatenate(sigmas), _LEAST_SIGMA_RAD) ** 2
         self._sizes = np.array([len(i) for _, _, i, _ in pairs])
         self._begins = np.append(0, np.cumsum(self._sizes)).astype(np.int64)
         self._gyro = IntegratedGyroscope(imu)
@@ -253,9 +257,16 @@ def _pairs(
 
 
 def _problem(
-    frames: Iterable[FeatureFrame], camera: RigCamera, pixel_sigma: float, imu: ImuBuffer
+    frames: Iterable[FeatureFrame],
+    camera: RigCamera,
+    pixel_sigma: float,
+    imu: ImuBuffer,
+    mounted: bool,
 ) -> _Problem | None:
-    """The frames that the gyroscope covers whatever the offset is; None if they are too few."""
+    """The frames that the gyroscope covers whatever the offset is; None if they are too few.
+
+    Rows are put at the time of the middle one where the rotation of the camera is known.
+    """
     nominal_ns = round(camera.clock_offset_s * 1e9)
     around_ns = round(MAX_OFFSET_S * 1e9) + 10_000_000
     chosen: list[tuple[int, Bearings]] = []
@@ -264,7 +275,7 @@ def _problem(
         if not imu.covers(stamp_ns - around_ns) or stamp_ns + around_ns > imu.newest_ns():
             continue
         if not chosen or frame.stamp_ns - chosen[-1][0] >= _SPACING_NS:
-            seen = at_middle_row(frame, camera, imu).cameras[0]
+            seen = (at_middle_row(frame, camera, imu) if mounted else frame).cameras[0]
             chosen.append((frame.stamp_ns, Bearings.of(seen, camera.camera, pixel_sigma)))
     if len(chosen) <= _LEAST_PAIRS:
         return None
@@ -294,8 +305,10 @@ def align_by_epipolar_errors(
     Returns:
         None if frames are too few, or the cost has no minimum within the range.
     """
-    problem = _problem(frames := list(frames), camera, pixel_sigma, imu)
-    if problem is None or (coarse is None and not mounted):
+    if coarse is None and not mounted:
+        return None
+    problem = _problem(frames := list(frames), camera, pixel_sigma, imu, mounted)
+    if problem is None:
         return None
     C, nominal_s = camera.body_T_camera.rotation().matrix(), camera.clock_offset_s
     start = _Guess(nominal_s, np.zeros(3), C)
@@ -311,15 +324,20 @@ def align_by_epipolar_errors(
     if not 0 < best < len(grid) - 1:
         return None
     found = replace(start, offset_s=float(grid[best]))
-    if camera.readout_s != 0.0:  # rows at the times that the offset found gives them
-        offset_s = camera.time_offset_s + found.offset_s - nominal_s
-        moved = replace(camera, time_offset_s=offset_s)
-        problem = _problem(frames, moved, pixel_sigma, imu) or problem
-    found, least = problem.minimized(found, _OFFSET if mounted else _ALL)
+    unknowns = _OFFSET if mounted else _ALL
+    found, least = problem.minimized(found, unknowns)
+    if not abs(found.offset_s - nominal_s) < MAX_OFFSET_S:
+        return None
     apart = np.abs(np.arange(len(grid)) - best) > 1
     margin = (float(np.min(np.array(costs)[apart])) - least.cost) / max(
         least.variance, _LEAST_VARIANCE
     )
+    if camera.readout_s != 0.0:  # rows at the times that offset and mounting give them
+        offset_s = camera.time_offset_s + found.offset_s - nominal_s
+        pose = gtsam.Pose3(gtsam.Rot3(found.body_R_camera), camera.body_T_camera.translation())
+        moved = replace(camera, body_T_camera=pose, time_offset_s=offset_s)
+        problem = _problem(frames, moved, pixel_sigma, imu, mounted=True) or problem
+        found, least = problem.minimized(found, unknowns)
     return _with_curvature(problem, found, least, columns, margin)
 
 

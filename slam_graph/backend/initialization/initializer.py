@@ -8,6 +8,9 @@ A start is tried at every frame until one succeeds. A start in motion has two pa
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import replace
+
 import numpy as np
 
 from slam_graph.arrays import IntArray
@@ -21,11 +24,13 @@ from slam_graph.backend.initialization.dynamic_refinement import (
 )
 from slam_graph.backend.initialization.dynamic_start import (
     StartFrames,
+    StartGuess,
     guess_states,
 )
 from slam_graph.backend.initialization.first_state import start_from, state_at_rest
 from slam_graph.backend.initialization.start_diagnosis import MIN_FEATURES, Refusal, likeliest_cause
 from slam_graph.backend.window import Window
+from slam_graph.geometry import NavState
 from slam_graph.sensors import FeatureFrame
 
 STATIC_DISPARITY_PX = 1.5
@@ -80,11 +85,13 @@ class Initializer:
         self._mode = mode
         waits = (unknown_scale or self._config.unknown_scale) == "wait"
         sigma = MAX_SCALE_SIGMA if waits else ROUGH_SCALE_SIGMA
+        self._max_scale_sigma = sigma
         self._refinement = DynamicRefinement(context, sigma)
         self._stamps_ns: list[int] = []
         self._frames: list[FeatureFrame] = []
         self._tried_ns: int | None = None
         self._in_vain = 0
+        self._solved: tuple[StartFrames, StartGuess] | None = None
         self._rng = np.random.default_rng(0)
         self._standstill = StandstillDetector(
             context.config.zero_velocity, STATIC_DISPARITY_PX, enabled=True
@@ -113,6 +120,25 @@ class Initializer:
             self._refusal = outcome
             return None
         return outcome
+
+    def solved_from(self, states: Mapping[int, NavState]) -> Window | None:
+        """The last start in motion once more, from an estimate; None if that does not fit better.
+
+        Args:
+            states: the estimate by its times, among them those of the frames of that start.
+        """
+        if self._solved is None:
+            return None
+        frames, guess = self._solved
+        if any(stamp_ns not in states for stamp_ns in frames.stamps_ns):
+            return None
+        estimated = [states[stamp_ns] for stamp_ns in frames.stamps_ns]
+        refinement = DynamicRefinement(self._context, self._max_scale_sigma)
+        found = refinement.refine(frames, replace(guess, states=estimated))
+        if isinstance(found, Refusal) or not refinement.fits_better_than(self._refinement):
+            return None
+        self._refinement = refinement
+        return found
 
     def waiting_for(self, calibration: str | None) -> str:
         """What a start still needs, and the likeliest cause of the lack.
@@ -178,7 +204,7 @@ class Initializer:
         )
         if isinstance(guess, Refusal):
             return guess
-        found = self._refinement.refine(frames, guess)
+        found, self._solved = self._refinement.refine(frames, guess), (frames, guess)
         self.scale_sigma = None if isinstance(found, Refusal) else self._refinement.scale_sigma
         return found
 

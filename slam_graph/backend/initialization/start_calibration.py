@@ -36,6 +36,8 @@ _LATER_TURNS = 10
 """Fewest rotations for a test of the clock later."""
 _REFINED_NS = 1_300_000_000
 """Time between two estimates by epipolar errors, which take longer."""
+_RESTS_RAD_S = 0.05
+"""Standard deviation of the angular rate below which there is none: it would show nothing."""
 _RETRY_NS, _LATER_RETRY_NS = 400_000_000, 900_000_000
 """Time between two estimates at the start, and between two tests of the clock later."""
 _LATER_PAUSE_NS, _LONGEST_PAUSE_NS = 5_000_000_000, 60_000_000_000
@@ -171,6 +173,8 @@ class StartCalibration:
         self, coarse: GyroAlignment | None, margin: float, frame: FeatureFrame, imu: ImuBuffer
     ) -> GyroAlignment | None:
         """By epipolar errors, once a second, what rotations of two views do not show as well."""
+        if np.linalg.norm(np.std(imu.data.gyro, axis=0)) < _RESTS_RAD_S:
+            return coarse
         if frame.stamp_ns < self._refined_ns + _REFINED_NS:
             return None
         self._refined_ns = frame.stamp_ns

@@ -63,6 +63,7 @@ class StartReview:
         self._from_standstill = self._trusted = scale_sigma is None
         self._without_scale = scale_sigma is not None and scale_sigma > MAX_SCALE_SIGMA
         self._initializer = Initializer(context, "motion", "wait")
+        self._states: dict[int, NavState] = {}  # the estimate since then, by its times
         self._diagnostics = context.diagnostics
         if scale_sigma is not None and self._without_scale:
             message = f"start with a scale that is known to {scale_sigma:.0%} only"
@@ -88,15 +89,24 @@ class StartReview:
             way = state.world_T_body.translation() - self._first.world_T_body.translation()
             self.done = bool(np.linalg.norm(way) > _KNOWN_AFTER_M)
             return None
+        self._states[stamp_ns] = state
         self.done = not self._without_scale and stamp_ns - self._doubtful_ns > _GIVE_UP_NS
         window = None if self.done else self._initializer.try_to_start(stamp_ns, frame)
         if window is None:
             return None
         self.done = True
-        if not contradict(state, window.current(window.prior), not self._from_standstill):
+        if not self._contradicts(state, window):
+            return None
+        # either may be a wrong minimum: what fits the frames better is right
+        window = self._initializer.solved_from(self._states) or window
+        if not self._contradicts(state, window):
             return None
         warn_of_correction(self._diagnostics, stamp_ns - self._begun_ns)
         return window
+
+    def _contradicts(self, state: NavState, window: Window) -> bool:
+        """Whether a window that begins at a state is another estimate of it."""
+        return contradict(state, window.current(window.prior), not self._from_standstill)
 
 
 def warn_of_correction(diagnostics: Diagnostics, since_ns: int) -> None:
