@@ -203,8 +203,7 @@ def _align_yaw(reference: FloatArray, estimate: FloatArray, least: float) -> Sim
     if not _determined(common, *across, least, across):
         raise DataError(
             f"cannot align the yaw of {len(reference)} positions that stand, or lie above one "
-            "another; "
-            "use --align none, or a recording that moves"
+            "another; use --align none, or a recording that moves"
         )
     rotation = Rotation.from_euler("z", np.arctan2(sine, cosine)).as_matrix()
     return Similarity(rotation, mean_reference - rotation @ mean_estimate)

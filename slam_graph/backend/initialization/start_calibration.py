@@ -37,7 +37,8 @@ _LATER_TURNS = 10
 _REFINED_NS = 1_300_000_000
 """Time between two estimates by epipolar errors, which take longer."""
 _RESTS_RAD_S = 0.05
-"""Standard deviation of the angular rate below which there is none: it would show nothing."""
+"""The platform turns too little for an estimate by epipolar errors where the standard deviation of
+the angular rate is below this."""
 _RETRY_NS, _LATER_RETRY_NS = 400_000_000, 900_000_000
 """Time between two estimates at the start, and between two tests of the clock later."""
 _LATER_PAUSE_NS, _LONGEST_PAUSE_NS = 5_000_000_000, 60_000_000_000
@@ -172,7 +173,17 @@ class StartCalibration:
     def _refined(
         self, coarse: GyroAlignment | None, margin: float, frame: FeatureFrame, imu: ImuBuffer
     ) -> GyroAlignment | None:
-        """By epipolar errors, once a second, what rotations of two views do not show as well."""
+        """The more certain of two estimates: by rotations of two views, and by epipolar errors.
+
+        Args:
+            coarse: the former, if there is one.
+            margin: with which a minimum is clear.
+            frame: the newest one.
+            imu: samples so far.
+
+        Returns:
+            None where there is none, or the last one by epipolar errors is too recent.
+        """
         if np.linalg.norm(np.std(imu.data.gyro, axis=0)) < _RESTS_RAD_S:
             return coarse
         if frame.stamp_ns < self._refined_ns + _REFINED_NS:
