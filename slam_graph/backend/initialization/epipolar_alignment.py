@@ -150,17 +150,17 @@ class _Problem:
         seen = self._first, self._second, self._variances, self._begins
         pair_equations(*seen, R, t, found, squares)
         cost = 0.5 * CAUCHY_WIDTH**2 * float(np.sum(np.log1p(squares)))
-        # the error of the gyroscope's rotation, eliminated
+        # without the error of the rotation by the gyroscope, which is eliminated
         noise = _GYROSCOPE_RAD**2
-        eased = np.linalg.solve(np.eye(3) + noise * found[:, :, :3], found)
-        cost -= 0.5 * noise * float(np.sum(found[:, :, 3] * eased[:, :, 3]))
+        marginal = np.linalg.solve(np.eye(3) + noise * found[:, :, :3], found)
+        cost -= 0.5 * noise * float(np.sum(found[:, :, 3] * marginal[:, :, 3]))
         rate_one, rate_two = self._gyro.rate(times) - at.bias
         J = np.empty((self.count, 3, 7))
         J[:, :, 0] = (rate_two - (rate_one[:, None] @ body)[:, 0]) @ C
         J[:, :, 1:4] = C.T @ by_bias
         J[:, :, 4:] = np.eye(3) - R.transpose(0, 2, 1)
-        H = np.sum(J.transpose(0, 2, 1) @ eased[:, :, :3] @ J, axis=0) + np.diag(self._prior)
-        g = np.sum(J.transpose(0, 2, 1) @ eased[:, :, 3:], axis=0)[:, 0]
+        H = np.sum(J.transpose(0, 2, 1) @ marginal[:, :, :3] @ J, axis=0) + np.diag(self._prior)
+        g = np.sum(J.transpose(0, 2, 1) @ marginal[:, :, 3:], axis=0)[:, 0]
         g[_BIAS] += self._prior[_BIAS] * at.bias
         cost += 0.5 * self._prior[1] * float(at.bias @ at.bias)
         return _Equations(cost, H, g, t, squares)
