@@ -116,6 +116,19 @@ def test_sound_tracks_have_no_faults(real_tracks: Recorded, stereo_tracks: Recor
     assert any(finding.kind == "scale" for finding in diagnosis.findings)
 
 
+def test_an_unknown_mounting_is_found_and_no_fault(stereo_tracks: Recorded) -> None:
+    rig = changed(
+        stereo_tracks[0],
+        lambda c: replace(c, body_T_camera=TURN_5 * c.body_T_camera, rotation_known=False),
+    )
+    diagnosis = judged(stereo_tracks, rig)
+    assert not diagnosis.faults, diagnosis.best_guess()
+    (found,) = (finding for finding in diagnosis.findings if finding.kind == "mounting")
+    right = stereo_tracks[0].cameras[0].body_T_camera.rotation()
+    turn = right.between(gtsam.Rot3(np.array(found.values["body_R_camera"])))
+    assert np.linalg.norm(gtsam.Rot3.Logmap(turn)) < np.deg2rad(0.5)
+
+
 @pytest.mark.parametrize(
     ("unit", "kind"),
     [

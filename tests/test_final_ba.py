@@ -15,7 +15,7 @@ import pytest
 from flight import FISHEYE, rig
 
 from slam_graph.backend.backend_config import BackendConfig
-from slam_graph.backend.smoothing import final_adjustment
+from slam_graph.backend.smoothing import final_adjustment, segment_adjustment
 from slam_graph.backend.smoothing.causal_outliers import causal_outliers
 from slam_graph.backend.smoothing.final_adjustment import FinalBa, adjust_recording, segments
 from slam_graph.backend.smoothing.frame_log import FrameLog
@@ -338,6 +338,6 @@ def test_what_the_images_do_not_confirm_is_refused(
     keep: Keep, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     kept = keep(flight(2, sigma=1.0))
-    monkeypatch.setattr(final_adjustment, "MAX_PIXEL_RESIDUAL", 0.5)
+    monkeypatch.setattr(segment_adjustment, "MAX_PIXEL_RESIDUAL", 0.5)
     with pytest.raises(EstimationError, match="do not fit"):
         kept.adjusted(kept.truth)

@@ -117,7 +117,8 @@ def random_images(rng: np.random.Generator) -> LinearReprojection:
     frames = tuple(range(KEYFRAMES))
     obs = Observations(np.arange(FEATURES), frames, feature, frame, camera, places, places)
     r, by_pose = rng.normal(size=(count, 2)), rng.normal(size=(count, 2, 6))
-    return LinearReprojection(obs, r, by_pose, rng.normal(size=(count, 2, 3)))
+    by_point = rng.normal(size=(count, 2, 3))
+    return LinearReprojection(obs, r, by_pose, by_point, np.ones(count), places)
 
 
 @pytest.fixture

@@ -33,7 +33,12 @@ def tracks(correlation: float, sigma: float, keyframes: int = KEYFRAMES) -> Line
         np.arange(TRACKS), tuple(range(keyframes)), feature, frame, camera, pixels, pixels
     )
     return LinearReprojection(
-        obs, residuals.reshape(-1, 2), np.zeros((len(obs), 2, 6)), by_point.reshape(-1, 2, 3)
+        obs,
+        residuals.reshape(-1, 2),
+        np.zeros((len(obs), 2, 6)),
+        by_point.reshape(-1, 2, 3),
+        np.ones(len(obs)),
+        pixels,
     )
 
 

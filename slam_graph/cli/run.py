@@ -133,6 +133,8 @@ def _overview(metrics: _Table) -> Iterator[tuple[str, str]]:
         yield "ms a frame", ", ".join(f"{name} {s['mean_ms']:.2f}" for name, s in stages.items())
     if metrics["final_ba"]:
         yield "final BA", _final_ba(metrics["final_ba"])
+        if metrics["final_ba"]["calibration_faults"]:
+            yield "calibration", "; ".join(metrics["final_ba"]["calibration_faults"])
     if metrics["loop_closure"]:
         table = metrics["loop_closure"]
         found = f"{table['accepted']} accepted of {table['verified']} verified"

@@ -176,6 +176,10 @@ def _judge_mounting(now: CameraAndGyroscope, fit: RotationFit) -> None:
     """Whether the calibrated rotation is wrong; it is corrected then."""
     R = now.rig.cameras[0].body_T_camera.rotation().matrix()
     turn, covariance = fit.turn_from(R)
+    if not now.rig.cameras[0].rotation_known:
+        now.findings.append(_found_mounting(fit.values.body_R_camera, covariance))
+        now.rig = _turned(now.rig, fit.values.body_R_camera @ R.T)
+        return
     away = float(np.linalg.norm(turn))
     sigmas = float(np.sqrt(turn @ np.linalg.solve(covariance, turn)))
     if away < _TURN_RAD * _noisier(fit) or sigmas < SIGMAS:
@@ -185,13 +189,37 @@ def _judge_mounting(now: CameraAndGyroscope, fit: RotationFit) -> None:
     if named.away_rad > max(_NAMED_RAD, 3 * sigma) or away < TURNED_RAD:
         named = Explanation("other", "", 0.0, np.eye(3))
     now.findings.append(_mounting_finding(named, fit.values.body_R_camera, away, sigma))
-    by = gtsam.Pose3(gtsam.Rot3(fit.values.body_R_camera @ R.T), np.zeros(3))
-    cameras = []
-    for mounted in now.rig.cameras:
-        pose = mounted.body_T_camera
-        pose = pose.inverse() if named.kind == "inverse" else by * pose
-        cameras.append(replace(mounted, body_T_camera=pose))
-    now.rig = replace(now.rig, cameras=tuple(cameras))
+    now.rig = (
+        _inverted(now.rig)
+        if named.kind == "inverse"
+        else _turned(now.rig, fit.values.body_R_camera @ R.T)
+    )
+
+
+def _turned(rig: Rig, R: FloatArray) -> Rig:
+    """The rig with all cameras turned about the IMU by a rotation (3, 3)."""
+    by = gtsam.Pose3(gtsam.Rot3(R), np.zeros(3))
+    cameras = (replace(c, body_T_camera=by * c.body_T_camera) for c in rig.cameras)
+    return replace(rig, cameras=tuple(cameras))
+
+
+def _inverted(rig: Rig) -> Rig:
+    """The rig with the mountings of all cameras the other way round."""
+    cameras = (replace(c, body_T_camera=c.body_T_camera.inverse()) for c in rig.cameras)
+    return replace(rig, cameras=tuple(cameras))
+
+
+def _found_mounting(R: FloatArray, covariance: FloatArray) -> Finding:
+    """The mounting that was found where it is unknown, which is no fault."""
+    sigma = np.rad2deg(np.sqrt(np.linalg.eigvalsh(covariance)[-1]))
+    what = f"the mounting of the camera, which is unknown, is found to {sigma:.1f}°"
+    fix = f"in the place of T_cam_imu: unknown, a T_cam_imu with the rotation {_rows(R)}"
+    return Finding("mounting", "info", what, fix, values={"body_R_camera": R.tolist()})
+
+
+def _rows(body_R_camera: FloatArray) -> str:
+    """The rotation from IMU to camera in one line."""
+    return " ".join(np.array2string(body_R_camera.T, precision=4, separator=", ").split())
 
 
 def _mounting_finding(named: Explanation, R: FloatArray, away: float, sigma: float) -> Finding:
@@ -200,8 +228,7 @@ def _mounting_finding(named: Explanation, R: FloatArray, away: float, sigma: flo
     what = (
         f"the camera is turned by {degrees:.1f}° ± {np.rad2deg(sigma):.1f}° against its calibration"
     )
-    rows = " ".join(np.array2string(R.T, precision=4, separator=", ").split())
-    fix = f"T_cam_imu: unknown in the calibration, or its rotation: {rows}"
+    fix = f"T_cam_imu: unknown in the calibration, or its rotation: {_rows(R)}"
     if named.kind == "inverse":
         what = f"{what}: {named.what}"
         fix = "give T_cam_imu (from IMU to camera) in a Kalibr file, T_BS (its inverse) in EuRoC's"

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import logging
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -22,11 +23,15 @@ from slam_graph.pipeline.stage import (
     warn_on_failure,
 )
 from slam_graph.results import RunResult
+from slam_graph.sensors import Rig
 
 _SMOOTHED = (*COMPLETED, "diverged")
 """Run statuses after which the recording is bundle adjusted (not after Ctrl-C)."""
 
 _FAILED = "no smoothed trajectory"
+_UNCALIBRATED = "the calibration is not corrected in the smoothed trajectory"
+_CALIBRATIONS = 3
+"""How often the recording is adjusted again with the calibration that it shows."""
 _SECOND = "no second adjustment with only what fits the causal trajectory"
 _LEAST_LEFT = 0.6
 """Features that do not fit the causal trajectory are left out where this part of the observations
@@ -103,12 +108,18 @@ class Smoothing(Stage):
         found = self._adjusted(log)
         if found is None:
             return
+        first, found = found, self._calibrated(log, found)
         is_apart, causes = self._contradiction(found)
         if is_apart:
-            again = self._consistent(log, found)
+            again = self._consistent(log, first)
             found = again or found
             if again is None:
                 self._diagnostics.warn("smoothed_contradicts", "; ".join(causes))
+        if found.calibration_faults:
+            off = "; ".join(fault.what for fault in found.calibration_faults)
+            self._diagnostics.warn(
+                "calibration_off", f"{off}: corrected in the smoothed trajectory"
+            )
         result.final_ba = found  # not one that may contradict, and of which nothing is said yet
         summary = found.summary
         logger.info(
@@ -119,11 +130,38 @@ class Smoothing(Stage):
             summary.seconds,
         )
 
-    def _adjusted(self, log: backend.FrameLog, consistent: bool = False) -> backend.FinalBa | None:
+    def _calibrated(self, log: backend.FrameLog, found: backend.FinalBa) -> backend.FinalBa:
+        """The adjustment with the calibration that it shows, where that it had is clearly wrong.
+
+        Args:
+            log: all frames.
+            found: the adjustment with the calibration of the run.
+        """
+        first = found
+        for _ in range(_CALIBRATIONS):
+            if found.calibration is None or not found.calibration_faults:
+                break
+            again = None
+            with warn_on_failure(self._diagnostics, "final_ba_failed", _UNCALIBRATED):
+                again = self._adjusted(log, found.calibration.rig)
+            if again is None or again.calibration is None:
+                break
+            logger.info("adjusted again: %s", found.calibration_faults[0].what)
+            found = again
+        if found is first or found.calibration is None or first.calibration is None:
+            return found
+        return replace(
+            found, calibration=replace(found.calibration, nominal=first.calibration.nominal)
+        )
+
+    def _adjusted(
+        self, log: backend.FrameLog, rig: Rig | None = None, consistent: bool = False
+    ) -> backend.FinalBa | None:
         """The adjustment of a log; None if it has too few observations.
 
         Args:
             log: all frames.
+            rig: the calibration; that of the run if not said.
             consistent: whether features that do not fit the causal trajectory are left out.
         """
         result = self._result
@@ -138,7 +176,7 @@ class Smoothing(Stage):
             log,
             result.trajectory,
             parts,
-            result.logs.calibration.rig(result.causal_rig),
+            rig or result.logs.calibration.rig(result.causal_rig),
             result.config.backend,
             result.config.final_ba,
             self._progress.adjusting,

@@ -177,6 +177,9 @@ class Verdict(Stage):
         )
         result.evidence = asdict(found)
         causes = list(found.causes) if found.contradicts else []
+        if adjusted is not None and not found.agrees:  # what was found has bent the estimate
+            faults = adjusted.calibration_faults[:2]
+            causes = [*(f"{f.what} (try --set {f.setting}=true)" for f in faults), *causes]
         unclear = self._diagnostics.counts["world_not_clear"] > 0
         if unclear:
             causes.append(_WORLD_NOT_CLEAR)

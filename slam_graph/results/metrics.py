@@ -230,7 +230,13 @@ def final_ba_table(
     accuracy = accuracy_table(truth, final_ba.trajectory, camera, breaks_ns)
     nees = consistency_table(truth, final_ba.history, False, final_ba, breaks_ns)
     fixes = {} if final_ba.fixes is None else {"fixes": final_ba.fixes.table()}
-    return {**asdict(final_ba.summary), "accuracy": accuracy, "nees": nees, **fixes}
+    checked = final_ba.calibration
+    calibration = {
+        "calibration": None if checked is None else checked.table(),
+        "calibration_faults": [fault.what for fault in final_ba.calibration_faults],
+    }
+    of_fit = {"accuracy": accuracy, "nees": nees, **calibration}
+    return {**asdict(final_ba.summary), **of_fit, **fixes}
 
 
 def loop_closure_table(

@@ -10,7 +10,7 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from operator import attrgetter
-from typing import Any, get_type_hints
+from typing import get_type_hints
 
 import numpy as np
 
@@ -154,18 +154,9 @@ class CalibrationLog:
             return given
         return replace(given, cameras=self.latest.rig.cameras[: len(given.cameras)])
 
-    def table(self) -> dict[str, dict[str, Any]] | None:
+    def table(self) -> dict[str, dict[str, float]] | None:
         """The last estimate: start, value and standard deviation of each parameter by its name."""
-        if self.latest is None:
-            return None
-        return {
-            parameter.name: {
-                "start": parameter.start,
-                "value": parameter.value,
-                "sigma": parameter.sigma,
-            }
-            for parameter in self.latest.parameters()
-        }
+        return None if self.latest is None else self.latest.table()
 
     def csv_lines(self) -> Iterator[str]:
         """The table as CSV: values of all parameters, then their standard deviations."""

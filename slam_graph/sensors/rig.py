@@ -296,6 +296,17 @@ class CalibrationEstimate:
             table += map(Parameter, names, start.tolist(), values.tolist(), sigmas.tolist())
         return table
 
+    def table(self) -> dict[str, dict[str, float]]:
+        """Start, value and standard deviation of each parameter by its name."""
+        return {
+            parameter.name: {
+                "start": parameter.start,
+                "value": parameter.value,
+                "sigma": parameter.sigma,
+            }
+            for parameter in self.parameters()
+        }
+
     def _values(self, variable: str) -> tuple[list[str], FloatArray, FloatArray]:
         """Names of a variable's parameters, their calibrated values, and their estimates."""
         kind, c = variable[0], int(variable[1:])

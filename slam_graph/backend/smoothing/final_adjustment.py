@@ -21,6 +21,8 @@ from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.backend.backend_config import BackendConfig
 from slam_graph.backend.smoothing.adjustment_figures import FinalBaSummary, summary_of, total_of
 from slam_graph.backend.smoothing.adjustment_progress import Report, SegmentProgress
+from slam_graph.backend.smoothing.calibration_equations import CalibrationEquations
+from slam_graph.backend.smoothing.calibration_faults import CalibrationFault, calibration_faults
 from slam_graph.backend.smoothing.causal_outliers import causal_outliers
 from slam_graph.backend.smoothing.frame_log import FrameLog
 from slam_graph.backend.smoothing.imu_noise_estimation import ImuNoiseFactors
@@ -34,14 +36,18 @@ from slam_graph.backend.smoothing.keyframe_states import (
 from slam_graph.backend.smoothing.pose_equations import PoseEquations
 from slam_graph.backend.smoothing.recording_problem import BundleAdjustment
 from slam_graph.backend.smoothing.recording_segment import RecordingSegment, read_segment
+from slam_graph.backend.smoothing.segment_adjustment import (
+    UndeterminedError,
+    adjust_segment,
+    check_minimum,
+)
 from slam_graph.backend.smoothing.smoothing_config import FinalBaConfig
 from slam_graph.backend.smoothing.smoothing_task import AdjustedSegment, SegmentStart, SmoothingTask
-from slam_graph.backend.smoothing.track_fusion import with_fused_features
 from slam_graph.backend.solve.single_thread import on_one_thread
 from slam_graph.backend.world_gauge import in_gauge_of, in_moved_world, world_motion
 from slam_graph.errors import EstimationError
 from slam_graph.geometry import NavState, StateHistory, Trajectory
-from slam_graph.sensors import AidingData, Rig
+from slam_graph.sensors import AidingData, CalibrationEstimate, Rig
 
 logger = logging.getLogger(__name__)
 
@@ -51,13 +57,6 @@ OVERLAP = 50
 _STRIDE, _CONTEXT = 10, 40
 """Backward extension: keyframes per stride, and later keyframes that are adjusted with them."""
 _MIN_KEYFRAMES = 3
-_MIN_OBSERVATIONS_PER_KEYFRAME = 2.0
-MAX_PIXEL_RESIDUAL = 3.0
-"""Root mean square of the reprojection residuals in σ beyond which a minimum is refused."""
-
-
-class _UndeterminedError(EstimationError):
-    """There are too few observations to improve on the causal estimate."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -76,6 +75,9 @@ class FinalBa:
             or are not known, and where the recording was adjusted in several segments.
         fixes: lever arm and clock of the position fixes, where they are variables; of the last
             segment.
+        calibration: what the recording says of the rig, by one step from the calibration it was
+            adjusted with; None if that is not known.
+        checked: the equations that this comes from.
         within: (N, 6, 6) pose covariances as those of the history, but relative to position and yaw
             of a state of the same world; None where all states are in one.
     """
@@ -87,6 +89,13 @@ class FinalBa:
     equations: PoseEquations | None = None
     fixes: AidingData.Calibration | None = None
     within: FloatArray | None = None
+    calibration: CalibrationEstimate | None = None
+    checked: CalibrationEquations | None = None
+
+    @property
+    def calibration_faults(self) -> list[CalibrationFault]:
+        """What of the calibration is clearly off, the clearest first."""
+        return [] if self.calibration is None else calibration_faults(self.calibration)
 
     @property
     def trajectory(self) -> Trajectory:
@@ -155,7 +164,28 @@ class FinalBa:
         last = parts[-1]
         summary = total_of([found.summary for found in parts])
         own = np.concatenate([found.within for found in parts if found.within is not None])
-        return FinalBa(history, summary, None, last.noise, fixes=last.fixes, within=own)
+        whole = FinalBa(history, summary, None, last.noise, fixes=last.fixes, within=own)
+        return whole.with_calibration([found.checked for found in parts], rig, backend)
+
+    def with_calibration(
+        self, parts: Sequence[CalibrationEquations | None], rig: Rig, backend: BackendConfig
+    ) -> FinalBa:
+        """With what parts of the recording say of the calibration.
+
+        Args:
+            parts: equations of each part, as far as they are known.
+            rig: the calibration that it was adjusted with.
+            backend: prior standard deviations.
+        """
+        checked = CalibrationEquations.total([part for part in parts if part is not None])
+        if checked is None:
+            return self
+        try:
+            end_ns = int(self.trajectory.stamps_ns[-1])
+            found = checked.estimate(rig, backend.calibration, end_ns)
+        except np.linalg.LinAlgError:
+            return self
+        return replace(self, checked=checked, calibration=found)
 
 
 def adjust_recording(
@@ -193,8 +223,11 @@ def adjust_recording(
     """
     try:
         task = SmoothingTask.of(rig, backend, config, least_noise)
-        return _smoothed(log, causal, replace(task, joint=joint), report)
-    except _UndeterminedError as reason:
+        checks = config.check_calibration and rig.has_imu and rig.depth is None
+        checks &= backend.dynamics.uses_imu(rig.has_imu)
+        task = replace(task, joint=joint, calibration=checks)
+        return _smoothed(log, causal, task, report)
+    except UndeterminedError as reason:
         logger.info("no final bundle adjustment: %s", reason)
         return None
 
@@ -204,15 +237,17 @@ def _smoothed(log: FrameLog, causal: Trajectory, task: SmoothingTask, report: Re
     began = (time.perf_counter(), time.process_time())
     keyframes = log.keyframes
     if len(keyframes) < _MIN_KEYFRAMES or len(causal) == 0:
-        raise _UndeterminedError(f"{len(keyframes)} keyframes are too few")
+        raise UndeterminedError(f"{len(keyframes)} keyframes are too few")
     longest, began_ns = task.config.max_keyframes, causal.stamps_ns[0]
     if task.rig.needs_two_views:  # nothing predicts the frames before the start well enough
         stamps_ns = log.frames_ns[keyframes] + round(task.rig.pose_offset_s * 1e9)
         keyframes = keyframes[stamps_ns >= began_ns]
         if len(keyframes) < _MIN_KEYFRAMES:
-            raise _UndeterminedError(f"{len(keyframes)} keyframes are too few")
+            raise UndeterminedError(f"{len(keyframes)} keyframes are too few")
     else:
-        causal = _extended_backward(log, causal, replace(task, joint=False), report)
+        causal = _extended_backward(
+            log, causal, replace(task, joint=False, calibration=False), report
+        )
     if len(keyframes) > longest:
         task = replace(task, joint=False)
     level = task.rig.has_imu
@@ -246,7 +281,7 @@ def _smoothed(log: FrameLog, causal: Trajectory, task: SmoothingTask, report: Re
         steps = sum(part.figures.iterations for part in solved)
         own = longest - _overlap(longest) if stop < len(keyframes) else stop - first
         progress = _progress(report, (first, own, len(keyframes)), steps, task.config)
-        adjusted = _adjusted(SegmentStart(segment, start, anchor), task, progress)
+        adjusted = adjust_segment(SegmentStart(segment, start, anchor), task, progress)
         found = adjusted.states  # steps leave the anchor where it was to some 1e-7 m
         held = found[int(segment.keyframes[anchor])]
         states = found[begin:]
@@ -263,7 +298,7 @@ def _smoothed(log: FrameLog, causal: Trajectory, task: SmoothingTask, report: Re
     figures = [part.figures for part in solved]
     alone = solved[0] if len(solved) == 1 else None
     summary = summary_of(figures, len(history), began)
-    return FinalBa(
+    whole = FinalBa(
         history,
         summary,
         None if alone is None else alone.aligned,
@@ -271,35 +306,13 @@ def _smoothed(log: FrameLog, causal: Trajectory, task: SmoothingTask, report: Re
         None if alone is None else alone.equations,
         solved[-1].fixes,
     )
+    checked = [part.calibration for part in solved]
+    return whole.with_calibration(checked, task.rig, task.backend)
 
 
 def _read(log: FrameLog, keyframes: IntArray, task: SmoothingTask) -> RecordingSegment:
     """The segment from the first of some keyframes to the last."""
     return read_segment(log, keyframes, task.rig, task.backend.zero_velocity)
-
-
-def _adjusted(
-    start: SegmentStart, task: SmoothingTask, progress: SegmentProgress
-) -> AdjustedSegment:
-    """The minimum of a segment with fused features; if fusion fails, with the original tracks."""
-    if task.config.fuse_features:
-        try:
-            fused, steps = with_fused_features(start, task, progress.fusing)
-
-            def report(step: int, passes: int) -> None:
-                progress.solving(steps + step, passes)
-
-            solved = BundleAdjustment(fused, task, report).solve()
-            _check(solved)
-            figures = solved.figures
-            return replace(solved, figures=replace(figures, iterations=figures.iterations + steps))
-        except _UndeterminedError:
-            raise
-        except (EstimationError, RuntimeError, np.linalg.LinAlgError) as error:
-            logger.warning("features are not fused: %s", " ".join(str(error).split())[:200])
-    solved = BundleAdjustment(start, task, progress.solving).solve()
-    _check(solved)
-    return solved
 
 
 def _extended_backward(
@@ -322,7 +335,7 @@ def _extended_backward(
         start = SegmentStart(segment, states, min(_STRIDE, len(known) - 1))
         progress = _progress(report, (0, 0, len(keyframes)), 0, task.config)
         solved = BundleAdjustment(start, task, progress.solving).solve()
-        _check(solved)
+        check_minimum(solved)
         earlier = [s for s in solved.states if s.stamp_ns < causal.stamps_ns[0]]
         causal = extended_by(earlier, causal)
     return causal
@@ -378,16 +391,3 @@ def _stamp_ns(state: NavState) -> int:
 def _overlaps(causal: Trajectory, stamps_ns: IntArray) -> bool:
     """Whether any of some times is within the causal estimate."""
     return bool(np.any((stamps_ns >= causal.stamps_ns[0]) & (stamps_ns <= causal.stamps_ns[-1])))
-
-
-def _check(solved: AdjustedSegment) -> None:
-    """Refuse a minimum that does not fit the observations."""
-    found = solved.figures
-    if found.observations < _MIN_OBSERVATIONS_PER_KEYFRAME * found.keyframes:
-        raise _UndeterminedError(
-            f"{found.observations} observations in {found.keyframes} keyframes are too few"
-        )
-    if not found.pixel_residual < MAX_PIXEL_RESIDUAL:
-        raise EstimationError(f"images do not fit: residuals of {found.pixel_residual:.1f} σ")
-    if not all(np.isfinite(state.world_T_body.matrix()).all() for state in solved.states):
-        raise EstimationError("a pose is not finite")

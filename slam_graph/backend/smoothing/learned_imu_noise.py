@@ -6,13 +6,17 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
 from scipy.linalg import blas
 
 from slam_graph.arrays import FloatArray
+from slam_graph.backend.smoothing.calibration_equations import (
+    CalibrationColumns,
+    CalibrationEquations,
+)
 from slam_graph.backend.smoothing.recording_cost import (
     Estimates,
     RecordingCost,
@@ -70,7 +74,8 @@ class _LinearImages:
     """
 
     def __init__(self, found: Minimum) -> None:
-        linear, keyframes = found.cost.linearized(found.estimates), found.cost.keyframes
+        self._linear = linear = found.cost.linearized(found.estimates)
+        keyframes = found.cost.keyframes
         self.features = linear.eliminated()
         self.gradient, self._t = self.features.reduced(*linear.images.gradient(keyframes))
         self._by_fixes = np.zeros(0)  # gradient by clock and lever arm of the fixes
@@ -80,6 +85,18 @@ class _LinearImages:
             self.gradient += fixes.reduced(by_pose, self._by_fixes)
         self._at_minimum = self.gradient.copy()
         self._moved = np.zeros((keyframes, STATE))  # increments of the states so far
+
+    def calibration(
+        self, columns: CalibrationColumns, states: EliminatedStates, chain: ChainEquations
+    ) -> CalibrationEquations:
+        """The equations of the calibration at the minimum.
+
+        Args:
+            columns: what their Jacobians are made of.
+            states: the factor of the states.
+            chain: the other factors, linearised at the minimum.
+        """
+        return columns.equations(replace(self._linear, chain=chain), self.features, states)
 
     def reset(self) -> None:
         """Go back to the minimum."""
@@ -129,6 +146,7 @@ class EliminatedMinimum:
             it, and agree to first order.
         states: the factor.
         fixes: lever arm and clock of position fixes; None where they are no variables.
+        calibration: equations of the parameters of the rig; None if they were not wanted.
     """
 
     images: ImageEquations | None
@@ -136,6 +154,7 @@ class EliminatedMinimum:
     values: gtsam.Values
     states: EliminatedStates
     fixes: AidingData.Calibration | None = None
+    calibration: CalibrationEquations | None = None
 
     def chain(self) -> ChainEquations:
         """The equations of the other factors."""
@@ -149,6 +168,7 @@ def equations_at_minimum(
     learn: bool,
     keep: bool,
     count_step: Callable[[], None],
+    columns: CalibrationColumns | None = None,
 ) -> EliminatedMinimum:
     """The normal equations with a fixed gauge, which covariances follow from.
 
@@ -164,6 +184,7 @@ def equations_at_minimum(
         learn: whether to estimate the noise of the IMU.
         keep: whether to keep what images say.
         count_step: is called after each step.
+        columns: of the calibration, if its equations are wanted.
 
     Raises:
         RuntimeError: if GTSAM cannot linearise a factor.
@@ -184,8 +205,12 @@ def equations_at_minimum(
     if cost.fixes is not None and features.fixes is not None:
         covariance = features.fixes.covariance(states)
         fixes = cost.fixes.calibration(moved.fixes, covariance)
+    calibration = None
+    if columns is not None:
+        chain = _chain(inertial, found.estimates.states)
+        calibration = images.calibration(columns, states, chain)
     kept = ImageEquations(features.poses, images.gradient) if keep else None
-    return EliminatedMinimum(kept, inertial, moved.states, states, fixes)
+    return EliminatedMinimum(kept, inertial, moved.states, states, fixes, calibration)
 
 
 def _learned(

@@ -125,7 +125,7 @@ class ReprojectionCost:
         residuals *= weights[:, None]
         by_pose *= weights[:, None, None]
         by_point *= weights[:, None, None]
-        return LinearReprojection(obs, residuals, by_pose, by_point)
+        return LinearReprojection(obs, residuals, by_pose, by_point, weights, views.normalized)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -137,17 +137,21 @@ class LinearReprojection:
         r: (N, 2).
         by_pose: (N, 2, 6) Jₓ, by the observing pose.
         by_point: (N, 2, 3) Jₚ, by the feature.
+        weights: (N,) what whitens and weights residuals in pixels.
+        normalized: (N, 2) where the features are predicted on the plane z = 1.
     """
 
     obs: Observations
     r: FloatArray
     by_pose: FloatArray
     by_point: FloatArray
+    weights: FloatArray
+    normalized: FloatArray
 
     def rows(self, keep: BoolArray) -> LinearReprojection:
         """Some of the observations, of the same features."""
-        parts = self.r[keep], self.by_pose[keep], self.by_point[keep]
-        return LinearReprojection(self.obs.rows(keep), *parts)
+        parts = self.r, self.by_pose, self.by_point, self.weights, self.normalized
+        return LinearReprojection(self.obs.rows(keep), *(part[keep] for part in parts))
 
     def gradient(self, keyframes: int) -> tuple[FloatArray, FloatArray]:
         """Jᵀ r by the poses (K, 6) and the features (J, 3)."""

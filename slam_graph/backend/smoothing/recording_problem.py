@@ -25,6 +25,7 @@ from slam_graph.backend.cost.reprojection import Geometry, RigProjection
 from slam_graph.backend.cost.robust_loss import MEDIAN_2D, RobustLoss
 from slam_graph.backend.depth_camera import is_of_depth
 from slam_graph.backend.smoothing.adjustment_figures import AdjustmentFigures
+from slam_graph.backend.smoothing.calibration_equations import CalibrationColumns
 from slam_graph.backend.smoothing.cost_minimization import minimized
 from slam_graph.backend.smoothing.imu_noise_estimation import ImuNoiseFactors
 from slam_graph.backend.smoothing.keyframe_states import (
@@ -96,7 +97,7 @@ class BundleAdjustment:
 
     def __init__(self, start: SegmentStart, task: SmoothingTask, report: Report) -> None:
         self._segment = segment = start.segment
-        self._task = replace(task, rig=with_gtsam_cameras(task.rig))
+        self._task, self._rig = replace(task, rig=with_gtsam_cameras(task.rig)), task.rig
         self._backend, self._config = backend, config = task.backend, task.config
         self._projection = RigProjection(self._task.rig, taken_by=task.rig)
         self._report = report
@@ -170,8 +171,9 @@ class BundleAdjustment:
             self._factors.noise = assumed
         figures = replace(figures, iterations=self.iterations)
         kept = equations if self._task.joint else None
-        fixes = None if equations is None else equations.minimum.fixes
-        return AdjustedSegment(states, figures, aligned, self.imu_noise, kept, fixes)
+        found = None if equations is None else equations.minimum
+        fixes, calibration = (None, None) if found is None else (found.fixes, found.calibration)
+        return AdjustedSegment(states, figures, aligned, self.imu_noise, kept, fixes, calibration)
 
     def solve_loosely(self, stamps_ns: IntArray) -> list[NavState]:
         """States near the minimum, with outliers, to a loose tolerance.
@@ -353,6 +355,9 @@ class BundleAdjustment:
             LinAlgError: if the minimum does not determine all variables.
         """
         near, self._factor = self._factor, None  # it is large
+        columns = None
+        if self._task.calibration:
+            columns = CalibrationColumns.of(self._rig, self._keyframe_states(), self._segment.imu)
         minimum = equations_at_minimum(
             self._minimum,
             near,
@@ -360,6 +365,7 @@ class BundleAdjustment:
             self._config.learn_imu_noise,
             self._task.joint,
             self._count_step,
+            columns,
         )
         densities, level = self._factors.densities(), self._task.rig.has_imu
         stamps_ns, keyframes = self._segment.stamps_ns, self._segment.keyframes

@@ -50,6 +50,9 @@ class FinalBaConfig(Settings):
     learn_imu_noise: bool = expert(True)
     """Whether the noise of the IMU that residuals show is used; the calibrated one is a lower
     bound."""
+    check_calibration: bool = expert(True)
+    """Whether mountings, lenses and time offset are estimated at the end, where there is an IMU. If
+    they are clearly off, the recording is adjusted again with those that were found."""
     max_iterations: int = expert(20, ge=1)
     """Largest number of Levenberg-Marquardt steps, before outliers are removed and after."""
     tolerance: float = expert(1e-4, gt=0)

@@ -13,6 +13,7 @@ from slam_graph.backend.backend_config import BackendConfig
 from slam_graph.backend.depth_camera import with_depth_camera
 from slam_graph.backend.dynamics import model_rig, without_imu
 from slam_graph.backend.smoothing.adjustment_figures import AdjustmentFigures
+from slam_graph.backend.smoothing.calibration_equations import CalibrationEquations
 from slam_graph.backend.smoothing.imu_noise_estimation import ImuNoiseFactors
 from slam_graph.backend.smoothing.pose_equations import PoseEquations
 from slam_graph.backend.smoothing.recording_segment import RecordingSegment
@@ -32,6 +33,7 @@ class SmoothingTask:
         causal: motion between keyframes where there is no IMU to predict it.
         least_noise: smallest factor on the noise of the IMU, or of the dynamics, that is learned.
         joint: whether the equations at the minimum are kept, which others can be joined to.
+        calibration: whether the equations of the calibration are wanted.
     """
 
     rig: Rig
@@ -40,6 +42,7 @@ class SmoothingTask:
     causal: Trajectory | None = None
     least_noise: float = 1.0
     joint: bool = False
+    calibration: bool = False
 
     @classmethod
     def of(
@@ -100,6 +103,7 @@ class AdjustedSegment:
         noise: factors on the noise of the IMU of this minimum.
         equations: those at the minimum, if they are wanted and there are covariances.
         fixes: lever arm and clock of position fixes, where they are variables.
+        calibration: equations of the calibration at the minimum, if they are wanted and known.
     """
 
     states: list[NavState]
@@ -108,3 +112,4 @@ class AdjustedSegment:
     noise: ImuNoiseFactors
     equations: PoseEquations | None
     fixes: AidingData.Calibration | None = None
+    calibration: CalibrationEquations | None = None

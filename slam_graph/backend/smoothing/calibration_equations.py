@@ -1,0 +1,192 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""How far the calibration is off, by one step at the minimum of a bundle adjustment.
+
+If the parameters e of the calibration were variables like states and features x, the next
+Gauss-Newton step from the minimum under the calibration as it is would move them by
+
+    δ = (S + P)⁻¹ g,   S = H_ee - H_ex H_xx⁻¹ H_xe,   g = g_e - H_ex H_xx⁻¹ g_x,
+
+with their prior P and the covariance (S + P)⁻¹. The factor of H_xx is there already, so that this
+costs little. The parameters are those of online calibration: where each camera is mounted, its
+focal lengths and principal point, and the time offset of all cameras. A camera that moves on the
+body by ξ in its own frame sees what it would see if the body moved by Ad_E ξ, E = body_T_camera;
+one that is late by τ, what it would see if the body had moved on by (ω, v) τ, its angular rate and
+velocity in its own frame.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import gtsam
+import numpy as np
+
+from slam_graph.arrays import FloatArray
+from slam_graph.backend.backend_config import CalibrationConfig
+from slam_graph.backend.online_calibration import rolling_motion
+from slam_graph.backend.smoothing.recording_cost import (
+    EliminatedFeatures,
+    LinearCost,
+    LinearReprojection,
+)
+from slam_graph.backend.smoothing.state_elimination import STATE, EliminatedStates
+from slam_graph.geometry import NavState
+from slam_graph.sensors import CalibrationEstimate, ImuBuffer, Rig, RigCamera
+
+_SIZES = {"e": 6, "k": 4, "t": 1}
+"""Components of a mounting (rotation, translation), of a lens (fx, fy, cx, cy), of the offset."""
+
+
+def variables_of(rig: Rig) -> dict[str, slice]:
+    """Columns of the parameters of a rig, named as in `CalibrationEstimate`.
+
+    A lens that GTSAM does not have is left out: the adjustment has a pinhole in its place.
+    """
+    columns: dict[str, slice] = {}
+    for name in [*_of_cameras(rig), "t0"]:
+        start = max((columns[known].stop for known in columns), default=0)
+        columns[name] = slice(start, start + _SIZES[name[0]])
+    return columns
+
+
+def _of_cameras(rig: Rig) -> Iterator[str]:
+    for c, mounted in enumerate(rig.cameras):
+        yield f"e{c}"
+        if mounted.camera.gtsam_calibration() is not None:
+            yield f"k{c}"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CalibrationEquations:
+    """Normal equations of the parameters e, all else eliminated, without their prior.
+
+    Attributes:
+        information: (n, n) S.
+        gradient: (n,) g.
+    """
+
+    information: FloatArray
+    gradient: FloatArray
+
+    @classmethod
+    def total(cls, parts: Iterable[CalibrationEquations]) -> CalibrationEquations | None:
+        """Those of several parts of a recording; None of none."""
+        parts = list(parts)
+        if not parts:
+            return None
+        information = np.sum([part.information for part in parts], axis=0)
+        return cls(information, np.sum([part.gradient for part in parts], axis=0))
+
+    def estimate(self, rig: Rig, config: CalibrationConfig, stamp_ns: int) -> CalibrationEstimate:
+        """The calibration after the step, with its covariance.
+
+        Args:
+            rig: the calibration that the equations were made with.
+            config: prior standard deviations.
+            stamp_ns: time of the estimate.
+
+        Raises:
+            LinAlgError: if the equations are not finite.
+        """
+        columns = variables_of(rig)
+        prior = np.concatenate([_sigmas(name, rig, config) for name in columns])
+        covariance = np.asarray(np.linalg.inv(self.information + np.diag(prior**-2.0)), np.float64)
+        step = covariance @ self.gradient
+        moved = _moved(rig, {name: step[own] for name, own in columns.items()})
+        blocks = {name: covariance[own, own] for name, own in columns.items()}
+        return CalibrationEstimate(stamp_ns, rig, moved, blocks)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CalibrationColumns:
+    """What the Jacobians by the calibration are made of.
+
+    Attributes:
+        rig: the calibration.
+        rates: (K, 6) angular rates and velocities of the keyframes, rad/s and m/s, body frame.
+    """
+
+    rig: Rig
+    rates: FloatArray
+
+    @classmethod
+    def of(cls, rig: Rig, states: Sequence[NavState], imu: ImuBuffer) -> CalibrationColumns:
+        """At the states of the keyframes, by the samples over them."""
+        lead_ns = round(rig.pose_offset_s * 1e9)
+        motions = [rolling_motion(s, s.stamp_ns - lead_ns, imu, rig) for s in states]
+        return cls(rig, np.array([motion.rate for motion in motions]))
+
+    def equations(
+        self, linear: LinearCost, features: EliminatedFeatures, states: EliminatedStates
+    ) -> CalibrationEquations:
+        """The equations at a minimum.
+
+        Args:
+            linear: the cost, linearised there.
+            features: the factor of its features.
+            states: that of its states.
+        """
+        images, keyframes = linear.images, len(linear.chain.gradient)
+        J = self._jacobians(images)
+        width = J.shape[2]
+        T, B = np.empty((3 * len(images.obs.ids), width)), np.zeros((keyframes, STATE, width))
+        for k in range(width):
+            column = replace(images, r=J[:, :, k])
+            reduced, t = features.reduced(*column.gradient(keyframes))
+            T[:, k], B[:, :6, k] = t.ravel(), reduced
+        by_state = linear.chain.gradient.copy()
+        reduced, t = features.reduced(*images.gradient(keyframes))
+        by_state[:, :6] += reduced
+        if linear.fixes is not None and features.fixes is not None:
+            by_state[:, :6] += features.fixes.reduced(*linear.fixes.gradient(keyframes))
+        rows, own = J.reshape(-1, width), B.reshape(-1, width)
+        held = states.times_covariance(B).reshape(own.shape)
+        return CalibrationEquations(
+            rows.T @ rows - T.T @ T - own.T @ held,
+            rows.T @ images.r.ravel() - T.T @ t.ravel() - held.T @ by_state.ravel(),
+        )
+
+    def _jacobians(self, images: LinearReprojection) -> FloatArray:
+        """Whitened derivatives (N, 2, n) of the pixels by the parameters."""
+        obs, columns = images.obs, variables_of(self.rig)
+        J = np.zeros((len(obs), 2, columns["t0"].stop))
+        J[:, :, -1] = np.einsum("nij,nj->ni", images.by_pose, self.rates[obs.frame])
+        for c, mounted in enumerate(self.rig.cameras):
+            rows = np.flatnonzero(obs.camera == c)
+            adjoint = mounted.body_T_camera.AdjointMap()
+            J[rows, :, columns[f"e{c}"]] = images.by_pose[rows] @ adjoint
+            if f"k{c}" in columns:
+                # where predicted: what was measured has errors in common with the residuals
+                by_lens = mounted.camera.by_intrinsics(images.normalized[rows])
+                J[rows, :, columns[f"k{c}"]] = images.weights[rows, None, None] * by_lens
+        return J
+
+
+def _sigmas(name: str, rig: Rig, config: CalibrationConfig) -> FloatArray:
+    """Prior standard deviations of a variable."""
+    if name == "t0":
+        return np.array([config.time_offset_sigma_s])
+    if name.startswith("e"):
+        return np.repeat([config.rotation_sigma_rad, config.position_sigma_m], 3)
+    focal = rig.cameras[int(name[1:])].camera.intrinsics[:2] * config.focal_length_sigma
+    return np.append(focal, np.repeat(config.principal_point_sigma_px, 2))
+
+
+def _moved(rig: Rig, steps: dict[str, FloatArray]) -> Rig:
+    """The rig with its parameters moved."""
+
+    def camera(c: int, mounted: RigCamera) -> RigCamera:
+        lens, pose = mounted.camera, gtsam.Pose3.Expmap(steps[f"e{c}"])
+        if f"k{c}" in steps:
+            fx, fy, cx, cy = (lens.intrinsics + steps[f"k{c}"]).tolist()
+            lens = replace(lens, fx=fx, fy=fy, cx=cx, cy=cy)
+        return replace(
+            mounted,
+            camera=lens,
+            body_T_camera=mounted.body_T_camera * pose,
+            time_offset_s=mounted.time_offset_s + float(steps["t0"][0]),
+        )
+
+    return replace(rig, cameras=tuple(camera(c, m) for c, m in enumerate(rig.cameras)))

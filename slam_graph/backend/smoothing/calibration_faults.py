@@ -1,0 +1,99 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""What of a calibration is clearly off, by an estimate of it with covariances, in words."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from slam_graph.arrays import FloatArray
+from slam_graph.sensors import CalibrationEstimate
+
+_SIGMAS = 6.0
+"""A difference counts from so many standard deviations on, and if it is larger than these, below
+which it hardly matters and calibrations are no better:"""
+_TURN_RAD, _MOVE_M = np.deg2rad(0.2), 0.015
+_FOCAL, _CENTRE_PX = 0.005, 3.0
+_OFFSET_S = 0.0015
+
+
+@dataclass(frozen=True, slots=True)
+class _Difference:
+    """A difference of some parameters from what they are taken for.
+
+    Attributes:
+        what: in words, with a place for the size and its standard deviation.
+        size: its length.
+        least: what counts.
+        sigmas: its Mahalanobis distance.
+    """
+
+    what: str
+    size: float
+    least: float
+    sigmas: float
+
+    @classmethod
+    def of(
+        cls, what: str, d: FloatArray, covariance: FloatArray, least: float, unit: float = 1.0
+    ) -> _Difference:
+        """Of a vector (n,) with its covariance (n, n); `unit` is what it is shown in."""
+        size = float(np.linalg.norm(d))
+        squared = float(np.dot(d, np.linalg.solve(covariance, d)))
+        sigmas = max(squared, 0.0) ** 0.5
+        sigma = size / max(sigmas, 1e-9)
+        return cls(what.format(size / unit, sigma / unit), size, least, sigmas)
+
+
+@dataclass(frozen=True, slots=True)
+class CalibrationFault:
+    """What of a calibration is clearly off.
+
+    Attributes:
+        what: in words.
+        setting: of online calibration, under which the estimator finds it.
+    """
+
+    what: str
+    setting: str
+
+
+_SETTINGS = {"e": "extrinsics", "k": "intrinsics", "t": "time_offset"}
+"""By the first letter of a variable."""
+
+
+def calibration_faults(found: CalibrationEstimate) -> list[CalibrationFault]:
+    """What is off, the clearest first; [] where the calibration fits."""
+    known = [(name, d) for name in found.covariances for d in _differences(found, name)]
+    off = [(name, d) for name, d in known if d.sigmas > _SIGMAS and d.size > d.least]
+    off.sort(key=lambda fault: fault[1].size / fault[1].least, reverse=True)
+    return [
+        CalibrationFault(d.what, f"backend.calibration.{_SETTINGS[name[0]]}") for name, d in off
+    ]
+
+
+def _differences(found: CalibrationEstimate, name: str) -> Iterator[_Difference]:
+    """How far a variable is from its calibration."""
+    covariance, number = found.covariances[name], int(name[1:])
+    old, new = found.nominal.cameras[number], found.rig.cameras[number]
+    if name.startswith("t"):
+        what = "the time offset of the cameras is {:.1f} ± {:.1f} ms off"
+        late = np.array([new.time_offset_s - old.time_offset_s])
+        yield _Difference.of(what, late, covariance, _OFFSET_S, 1e-3)
+    elif name.startswith("e"):
+        what = f"cam{number} is turned by {{:.2f}}° ± {{:.2f}}° against its calibration"
+        step = old.body_T_camera.localCoordinates(new.body_T_camera)
+        yield _Difference.of(what, step[:3], covariance[:3, :3], _TURN_RAD, np.deg2rad(1.0))
+        what = f"cam{number} is {{:.0f}} ± {{:.0f}} mm away from where it is calibrated"
+        yield _Difference.of(what, step[3:], covariance[3:, 3:], _MOVE_M, 1e-3)
+    else:
+        focal, change = old.camera.intrinsics[:2], new.camera.intrinsics - old.camera.intrinsics
+        what = f"the focal lengths of cam{number} are {{:.1f}} ± {{:.1f}} % off"
+        both = focal * np.sqrt(2.0)  # so that the length is the root mean square of the two
+        relative = covariance[:2, :2] / np.outer(both, both)
+        yield _Difference.of(what, change[:2] / both, relative, _FOCAL, 1e-2)
+        what = f"the principal point of cam{number} is {{:.1f}} ± {{:.1f}} px off"
+        yield _Difference.of(what, change[2:], covariance[2:, 2:], _CENTRE_PX)
