@@ -6,7 +6,8 @@ Beside the noise of single observations a track has three slow errors, which las
 constant offset of its matches in the other cameras (pixels), and the rates at which its patch
 slides off its point in the first camera and in the others (pixels/s). Each has two pixel
 coordinates with a Gaussian prior, and is estimated with the point. The shares of an observation
-say by how much it changes with each of the three.
+say by how much it changes with each of the three. Those of one pixel coordinate do not depend on
+those of the other, and are eliminated before position and velocity are solved for.
 """
 
 from __future__ import annotations
@@ -20,10 +21,6 @@ from slam_graph.kernels.compilation import compiled
 
 __all__ = ["motion_steps", "motion_steps_numpy"]
 
-_SIZE = 12
-"""Unknowns of a track: position, velocity, and two pixel coordinates of three slow errors."""
-_ENTRIES = 9
-"""Of them in a row: it has one coordinate of the slow errors only."""
 _LOST = 1e-12
 """Used as pivot where rounding gives zero: beside 1e20 the prior's share is lost."""
 _STILL = 1e-9
@@ -31,19 +28,20 @@ _STILL = 1e-9
 
 
 @compiled()
-def _solve(A: FloatArray) -> None:
+def _solve(A: FloatArray, m: int) -> None:
     """Solve H X = B in the place of B, for A = [H B] (m, m + k).
 
     With pivots: where a point is all but in a camera, rounding makes H indefinite.
     """
-    m, n = A.shape
+    n = A.shape[1]
     for c in range(m):
         pivot = c
         for i in range(c + 1, m):
             if abs(A[i, c]) > abs(A[pivot, c]):
                 pivot = i
-        for k in range(c, n):
-            A[c, k], A[pivot, k] = A[pivot, k], A[c, k]
+        if pivot != c:
+            for k in range(c, n):
+                A[c, k], A[pivot, k] = A[pivot, k], A[c, k]
         if A[c, c] == 0.0:
             A[c, c] = _LOST
         for i in range(c + 1, m):
@@ -58,15 +56,105 @@ def _solve(A: FloatArray) -> None:
 
 
 @compiled()
+def _sum_up(
+    j: int,
+    by_point: FloatArray,
+    residuals: FloatArray,
+    in_camera: FloatArray,
+    shares: FloatArray,
+    since: FloatArray,
+    starts: IntArray,
+    sigma: float,
+    x: FloatArray,
+    H: FloatArray,
+    F: FloatArray,
+) -> tuple[float, float]:
+    """Sum up the observations of track j; the other arguments are those of `motion_steps`.
+
+    Filled are H (6, 7 + k), the equations of position and velocity with their right-hand side in
+    column 6, and F (2, 3, 10), those of the slow errors in each pixel coordinate: their own three
+    columns, six of position and velocity, and the right-hand side. The result is the sum of the
+    squared errors over σ², and the least depth, m.
+    """
+    H[:] = 0.0
+    F[:] = 0.0
+    square, depth, scale = 0.0, np.inf, 1.0 / sigma
+    for n in range(starts[j], starts[j + 1]):
+        depth, t = min(depth, abs(in_camera[n, 2])), since[n]
+        for i in range(2):
+            r = residuals[n, i] * scale
+            for k in range(3):
+                r -= shares[n, k] * x[j, 6 + 2 * k + i]
+            square += r * r
+            for a in range(3):
+                slope = by_point[n, i, a] * scale
+                H[a, 6] += slope * r
+                H[3 + a, 6] += slope * t * r
+                for b in range(a + 1):
+                    product = slope * by_point[n, i, b] * scale
+                    H[a, b] += product
+                    H[3 + a, b] += product * t
+                    H[3 + a, 3 + b] += product * t * t
+            for k in range(3):
+                share = shares[n, k]
+                if share == 0.0:  # most are
+                    continue
+                F[i, k, 9] += share * r
+                for a in range(3):
+                    product = share * by_point[n, i, a] * scale
+                    F[i, k, 3 + a] += product
+                    F[i, k, 6 + a] += product * t
+                    F[i, k, a] += share * shares[n, a]
+    for a in range(3):
+        for b in range(a):
+            H[3 + b, a] = H[3 + a, b]
+    for a in range(6):
+        for b in range(a):
+            H[b, a] = H[a, b]
+    return square, depth
+
+
+@compiled()
+def _eliminate(F: FloatArray, H: FloatArray) -> None:
+    """Take slow errors out of the equations H (6, 7) of a track.
+
+    Args:
+        F: (3, 10) [N C b] of slow errors; N⁻¹ [C b] is left in its last columns.
+        H: (6, 7 + k) [H b], less Cᵀ N⁻¹ [C b] afterwards.
+    """
+    C = F[:, 3:9].copy()
+    _solve(F, 3)
+    for a in range(6):
+        for k in range(3):
+            for b in range(7):
+                H[a, b] -= C[k, a] * F[k, 3 + b]
+
+
+@compiled()
 def _step(
-    A: FloatArray, x: FloatArray, depth: float, reach: float, largest: float, column: int
+    H: FloatArray, F: FloatArray, x: FloatArray, depth: float, reach: float, largest: float
 ) -> None:
-    """Move a track x (12,) by a column of A; by less where that leads through a camera."""
-    moved = math.sqrt(A[0, column] ** 2 + A[1, column] ** 2 + A[2, column] ** 2)
-    moved += math.sqrt(A[3, column] ** 2 + A[4, column] ** 2 + A[5, column] ** 2) * reach
+    """Move a track x (12,) by the solution; by less where that leads through a camera.
+
+    Args:
+        H: (6, 7 + k) solved, that of position and velocity in column 6.
+        F: (2, 3, 10) as `_eliminate` leaves them.
+        x: moved.
+        depth: the least one, m.
+        reach: largest time, s.
+        largest: part of the depth.
+    """
+    moved = math.sqrt(H[0, 6] ** 2 + H[1, 6] ** 2 + H[2, 6] ** 2)
+    moved += math.sqrt(H[3, 6] ** 2 + H[4, 6] ** 2 + H[5, 6] ** 2) * reach
     part = min(1.0, largest * depth / max(moved, _STILL))
-    for a in range(_SIZE):
-        x[a] += A[a, column] * part
+    for a in range(6):
+        x[a] += H[a, 6] * part
+    for i in range(2):
+        for k in range(3):
+            error = F[i, k, 9]
+            for a in range(6):
+                error -= F[i, k, 3 + a] * H[a, 6]
+            x[6 + 2 * k + i] += error * part
 
 
 @compiled(
@@ -112,47 +200,30 @@ def motion_steps(
         covariances: (J, 3, 3), filled: of the velocities; (0, 3, 3) where they are not wanted.
     """
     velocities = 3 if len(covariances) else 0
-    H, h = np.empty((_SIZE, _SIZE + 1 + velocities)), np.empty(_ENTRIES)
-    sums, pulls = np.empty((2, _ENTRIES, _ENTRIES)), np.empty((2, _ENTRIES))
+    H, F = np.empty((6, 7 + velocities)), np.empty((2, 3, 10))
     for j in range(len(x)):
-        sums[:] = 0.0
-        pulls[:] = 0.0
-        squares[j] = 0.0
-        depth = np.inf
-        for n in range(starts[j], starts[j + 1]):
-            depth = min(depth, abs(in_camera[n, 2]))
-            for i in range(2):
-                r = residuals[n, i] / sigma
-                for k in range(3):
-                    slope = by_point[n, i, k] / sigma
-                    h[k], h[3 + k], h[6 + k] = slope, slope * since[n], shares[n, k]
-                    r -= shares[n, k] * x[j, 6 + 2 * k + i]
-                squares[j] += r * r
-                for a in range(_ENTRIES):
-                    pulls[i, a] += h[a] * r
-                    for b in range(a + 1):
-                        sums[i, a, b] += h[a] * h[b]
-        H[:] = 0.0
-        for a in range(_SIZE):
-            H[a, a] = information[a]
-            H[a, _SIZE] = information[a] * (before[j, a] - x[j, a])
+        squares[j], depth = _sum_up(
+            j, by_point, residuals, in_camera, shares, since, starts, sigma, x, H, F
+        )
         for i in range(2):
-            for a in range(_ENTRIES):
-                row = a if a < 6 else 2 * a - 6 + i
-                H[row, _SIZE] += pulls[i, a]
-                for b in range(a + 1):
-                    H[row, b if b < 6 else 2 * b - 6 + i] += sums[i, a, b]
-        for a in range(_SIZE):
-            for b in range(a):
-                H[b, a] = H[a, b]
-        for k in range(velocities):
-            H[3 + k, _SIZE + 1 + k] = 1.0
-        _solve(H)
+            for k in range(3):
+                row = 6 + 2 * k + i
+                F[i, k, k] += information[row]
+                F[i, k, 9] += information[row] * (before[j, row] - x[j, row])
+        for a in range(6):
+            H[a, a] += information[a]
+            H[a, 6] += information[a] * (before[j, a] - x[j, a])
+        for i in range(2):
+            _eliminate(F[i], H)
+        for a in range(6):
+            for k in range(velocities):
+                H[a, 7 + k] = 1.0 if a == 3 + k else 0.0
+        _solve(H, 6)
         for k in range(velocities):
             for m in range(3):
-                covariances[j, m, k] = H[3 + m, _SIZE + 1 + k]
+                covariances[j, m, k] = H[3 + m, 7 + k]
         if largest > 0.0:
-            _step(H, x[j], depth, reach, largest, _SIZE)
+            _step(H, F, x[j], depth, reach, largest)
         for n in range(starts[j], starts[j + 1]):
             for k in range(3):
                 seen[n, k] = x[j, k] + since[n] * x[j, 3 + k]

@@ -131,6 +131,8 @@ class Cost:
     sigma_px: FloatArray | None = None
     defines_unit: ClassVar[bool] = False  # whether its factors say what the unit of length is
     _layout: tuple[tuple[object, ...], Layout] | None = field(default=None, init=False)  # the last
+    _jacobians: dict[int, gtsam.JacobianFactor] = field(default_factory=dict)  # by id of the factor
+    _squares: tuple[tuple[object, ...], FloatArray] = field(default=((), np.zeros(0)), init=False)
 
     @property
     def robust(self) -> RobustLoss:
@@ -223,11 +225,15 @@ class Cost:
             obs: of features at `points` (J, 3), or of features of the state where these are None.
             points: in the world.
         """
+        depends_on = obs, points, self.state.frames, self.state.points
+        if _are_same(self._squares[0], depends_on):  # the gate after the steps asks again
+            return self._squares[1]
         rig = self.rig.at(self.state)
         points = self.state.positions_of(obs.ids) if points is None else points
         residuals, _ = rig.residuals(obs, self._geometry(rig, obs, points))
         squares = np.einsum("ni,ni->n", residuals, residuals)
-        return np.asarray(squares / self.sigmas(obs) ** 2, dtype=np.float64)
+        self._squares = depends_on, np.asarray(squares / self.sigmas(obs) ** 2, dtype=np.float64)
+        return self._squares[1]
 
     # --- linearisation -------------------------------------------------------------------------
 
@@ -271,12 +277,14 @@ class Cost:
         Ab = np.zeros((sum(factor.dim() for factor in self.factors), layout.size + 1), order="F")
         for factor in self.factors:
             assert isinstance(factor, gtsam.NoiseModelFactor)
-            jacobian = factor.linearize(first)
+            jacobian = self._jacobians.get(id(factor)) or factor.linearize(first)
             if not isinstance(jacobian, gtsam.JacobianFactor):
                 jacobian = gtsam.JacobianFactor(jacobian)
-            A, _ = jacobian.jacobian()
+            keys, (A, _) = jacobian.keys(), jacobian.jacobian()
+            if self.prior.layout.dims.keys() >= set(keys):  # first estimates of these do not move
+                self._jacobians[id(factor)] = jacobian
             rows = slice(end, end + len(A))
-            Ab[rows, layout.indices(jacobian.keys())] = A
+            Ab[rows, layout.indices(keys)] = A
             Ab[rows, -1] = -factor.whitenedError(now)
             end = rows.stop
             if isinstance(factor, gtsam.CombinedImuFactor):

@@ -23,7 +23,9 @@ from slam_graph.arrays import BoolArray, FloatArray, IntArray
 from slam_graph.backend.backend_config import BackendConfig
 from slam_graph.backend.cost.feature_tracks import is_in
 from slam_graph.backend.cost.gating import threshold
+from slam_graph.backend.cost.robust_loss import RobustLoss
 from slam_graph.backend.objects.ego_motion import EgoMotion
+from slam_graph.backend.objects.free_motion import freely_fitted
 from slam_graph.backend.objects.objects_config import ObjectsConfig
 from slam_graph.backend.objects.relative_motion import RelativeMotion, motion_over
 from slam_graph.backend.objects.track_assignment import FITS
@@ -35,6 +37,9 @@ _LEAST_FRAMES = 3
 """Frames of a window that tell anything."""
 _AGAIN = 0.01
 """Probability with which an object begins again without need; what it loses is its past."""
+_NEARLY = 0.75
+"""Part of the gain with which an object begins again, that free poses must have: from other poses
+an estimate may find a motion that is a little better than what is found near the one it has."""
 _LABEL = 2.0 * float(np.log(2.0))
 """What it costs that a track may be of either half: both are as likely."""
 _ROUNDS = 2
@@ -81,7 +86,7 @@ class ObjectReview:
         least = self._config.min_points
         members = item.taken
         # an estimate that begins anew costs most, and is made only where it can be better
-        if not self._in_doubt(item, members):
+        if not self._in_doubt(item, members) or not self._promising(item, members):
             return []
         anew = self._begun(members)
         if anew is None:
@@ -91,9 +96,8 @@ class ObjectReview:
             return []
         current = self._total(members, item, stamps)
         best, part = self._total(members, anew.motion, stamps), anew
-        limit = float(chdtri(6 * (len(stamps) - 1), self._config.false_alarm))
         halves: list[Part] = []
-        enough = limit + _LABEL * len(members)
+        enough = self._enough(members, stamps)
         if (
             item.label == 0  # masks tell objects apart
             and len(members) >= 2 * least
@@ -108,8 +112,8 @@ class ObjectReview:
             apart = sum(self._total(half.members, half.motion, stamps) for half in halves)
             if min(current, best) - apart > enough:
                 return halves
-        again = float(chdtri(6 * (len(stamps) - 1), _AGAIN))
-        return [Part(item.members, part.motion)] if current - best > again else []
+        again = current - best > _as_chance(stamps, _AGAIN)
+        return [Part(item.members, part.motion)] if again else []
 
     def _in_doubt(self, item: TrackedObject, members: IntArray) -> bool:
         """Whether an estimate fills the window, and its errors are larger than those of one body.
@@ -120,6 +124,47 @@ class ObjectReview:
         if not self._fill_the_window(stamps):
             return False
         return self._total(members, item, stamps) > self._expected(members, stamps)
+
+    def _promising(self, item: TrackedObject, members: IntArray) -> bool:
+        """Whether poses that are free of one another fit so well that a new estimate may as well.
+
+        Those of all tracks, or of two halves. What an estimate finds obeys dynamics, too.
+        """
+        stamps = [stamp for stamp in self._window.stamps_ns if stamp in item.poses]
+        current = self._total(members, item, stamps)
+        free = self._free_squares(members, members, item, stamps)
+        if current - float(free.sum()) > _NEARLY * _as_chance(stamps, _AGAIN):
+            return True
+        members, pixels = self._window.pixels(members)
+        least = self._config.min_points
+        if item.label or len(members) < 2 * least:
+            return False
+        first = _one_side(pixels)
+        if min(np.count_nonzero(first), np.count_nonzero(~first)) < least:
+            return False
+        of_halves = (
+            self._free_squares(members[part], members, item, stamps) for part in (first, ~first)
+        )
+        together = float(np.minimum(*of_halves).sum()) - 6 * (len(stamps) - 1)
+        return together <= current - self._enough(members, stamps)
+
+    def _free_squares(
+        self, part: IntArray, members: IntArray, item: TrackedObject, stamps: list[int]
+    ) -> FloatArray:
+        """(N,) squared errors of tracks under the free poses that fit a part of them best."""
+        poses = [item.poses[stamp] for stamp in stamps]
+        obs = self._window.observations(part, _LEAST_FRAMES, stamps)
+        points = self._window.triangulated(obs, stamps, poses).points
+        known = np.asarray(np.isfinite(points).all(axis=1))
+        obs, rig = obs.subset(known), self._window.projection(stamps, poses)
+        loss = RobustLoss(self._policies[1].gating.loss)
+        given = obs, rig, poses, points[known], self._sigma_px, loss
+        fitted = freely_fitted(*given) if len(obs) else poses
+        return self._squares(members, dict(zip(stamps, fitted, strict=True)))
+
+    def _enough(self, members: IntArray, stamps: list[int]) -> float:
+        """By how much squared errors of two halves must be less than those of one body."""
+        return _as_chance(stamps, self._config.false_alarm) + _LABEL * len(members)
 
     def _fill_the_window(self, stamps: list[int]) -> bool:
         """Whether a motion is known over the whole window; earlier too many motions fit."""
@@ -187,6 +232,11 @@ class ObjectReview:
         if len(poses) < len(stamps):
             return np.inf
         return float(self._squares(members, poses).sum())
+
+
+def _as_chance(stamps: list[int], probability: float) -> float:
+    """By how much a further motion over some frames lowers squared errors by chance."""
+    return float(chdtri(6 * (len(stamps) - 1), probability))
 
 
 def _one_side(pixels: FloatArray) -> BoolArray:
