@@ -20,7 +20,6 @@ from slam_graph.sensors import FeatureFrame, ImuData, Rig
 from slam_graph.simulation import simulate
 
 TURN_DEG = 1.0
-CHANGES = ("right", "turned", "late", "longer")
 
 
 def given(rig: Rig, change: str) -> Rig:
@@ -103,3 +102,12 @@ def test_a_wrong_one_is_named_and_corrected(change: str, said: str) -> None:
     assert np.rad2deg(np.linalg.norm(gtsam.Rot3.Logmap(turn))) < 0.1 * TURN_DEG
     assert shown.camera.intrinsics == pytest.approx(right.camera.intrinsics, abs=0.9)
     assert error_m(change) < 2.0 * error_m("right")
+
+
+def test_a_small_offset_that_is_found_late_loses_nothing() -> None:
+    late, right = (adjusted(change).trajectory for change in ("late", "right"))
+    assert abs(int(late.stamps_ns[0]) - int(right.stamps_ns[0])) < 10_000_000
+    assert adjusted("late").status == "ok"
+    truth = flight().groundtruth()
+    assert truth is not None
+    assert ape(truth, late, alignment="yaw").statistics.rmse < 0.03

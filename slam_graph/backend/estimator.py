@@ -252,7 +252,7 @@ class Estimator(EstimatorKnowledge):
             return None
         self._latest_ns = self.times_ns[frame.stamp_ns] = stamp_ns
         self._motions.keep(frame)
-        imu.forget_before(stamp_ns - _HISTORY_NS)
+        imu.forget_before(self._check.needed_since_ns(stamp_ns) - _HISTORY_NS)
         frame = with_depth_observed(frame, self._real_rig)
         frame, bad = frame.usable(len(self.rig.cameras))
         if bad:

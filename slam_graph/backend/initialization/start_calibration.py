@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass, replace
+from itertools import islice
 
 import gtsam
 import numpy as np
@@ -45,8 +46,9 @@ _LATER_PAUSE_NS, _LONGEST_PAUSE_NS = 5_000_000_000, 60_000_000_000
 """Time after an estimate that shows nothing, and after many of them: each takes 0.1 s."""
 _WAIT_NS = 5_000_000_000
 """A start waits so long for an offset that was right before to fit again; then it takes the new."""
-_RECENT_NS = 6_000_000_000
-"""How long frames are kept to begin anew from."""
+_RECENT_NS, _OPEN_NS = 6_000_000_000, 20_000_000_000
+"""How long frames are kept to begin anew from, and how long while the calibration is open. What was
+estimated before the first of them is lost then."""
 _CLEAR_WAITING = 15.0
 """Smallest margin of a minimum as long as there is no state that could be lost."""
 _ADOPTED_SIGMAS, _ADOPTED_S = 8.0, 4e-3
@@ -117,6 +119,10 @@ class StartCalibration:
         self._static.clear()
         self._doubted_ns = None
 
+    def needed_since_ns(self, stamp_ns: int) -> int:
+        """The earlier one of a time and the first frame to begin anew from, if there is one."""
+        return min([stamp_ns, *(frame.stamp_ns for frame in islice(self.recent, 1))])
+
     def add(
         self, frame: FeatureFrame, imu: ImuBuffer, started: bool, dynamic: IntArray
     ) -> FoundCalibration | ClockChange | None:
@@ -138,9 +144,8 @@ class StartCalibration:
         self.recent.append(frame)
         frame = frame.without(dynamic)
         self._static.append(frame)
-        while frame.stamp_ns - self.recent[0].stamp_ns > _RECENT_NS:
-            self.recent.popleft()
-            self._static.popleft()
+        _keep(self.recent, _RECENT_NS if self.done else _OPEN_NS)
+        _keep(self._static, _RECENT_NS)
         monitor = self._monitor if started else None
         if self.done:
             return self._watch(frame, imu, monitor)
@@ -307,3 +312,9 @@ class StartCalibration:
 
 def _uncertainty(found: GyroAlignment) -> tuple[float, float]:
     return found.rotation_sigma_rad, found.offset_sigma_s
+
+
+def _keep(frames: deque[FeatureFrame], last_ns: int) -> None:
+    """Forget all frames but the last ones."""
+    while frames[-1].stamp_ns - frames[0].stamp_ns > last_ns:
+        frames.popleft()
