@@ -50,6 +50,8 @@ LONGEST = (
     "datasets_contract", "window_graph", "simulation_images", "estimator_bad_input", "signals",
     "initialization_clock", "imu_consistent_path", "rerun", "without_imu", "rolling_shutter",
     "calibration_convergence", "imu_noise_estimation", "gauge_steps", "objects", "public_api",
+    "epipolar_alignment", "second_compiler", "frontend_robustness", "track_drift", "known_poses",
+    "smoothed_covariances", "fault_injection",
 )  # fmt: skip
 """Files of tests that take longest in the quick group, by their CPU time; they run first, so that
 no core ends with one."""

@@ -4,7 +4,7 @@
 
 import numpy as np
 import pytest
-from estimating import from_given_state
+from estimating import BELIEVED, from_given_state
 
 from slam_graph.backend.backend_config import NoiseConfig
 from slam_graph.backend.cost.adaptive_imu_noise import (
@@ -135,6 +135,7 @@ def mean_nees(noise_scale: float, adaptive: bool) -> float:
         "backend.initialization.mode=given",
         "cameras=2",
         "final_ba.enabled=false",
+        BELIEVED,
     ]
     sequence = simulate(SimulationConfig(**flight, tracks={"features": 40}))
     result = run(sequence, load_config(algorithm="msckf", overrides=overrides))

@@ -8,6 +8,7 @@ from pathlib import Path
 import gtsam
 import numpy as np
 import pytest
+from estimating import BELIEVED
 from flight import AT_REST, packets, rig, room
 from groups import slow
 from gtsam.symbol_shorthand import V, X
@@ -255,8 +256,12 @@ def test_a_stop_during_a_flight_loses_nothing(algorithm: str) -> None:
     Simulated figures of eight with stops of four seconds, with one pixel of noise.
     """
     flight = {"hover_s": 4.0, "hover_every_s": 6.0}
-    sequence = simulate(duration_s=14.0, seed=7, cameras=2, flight=flight, tracks={"features": 60})
-    result = run(sequence, load_config(algorithm=algorithm, overrides=["final_ba.enabled=false"]))
+    sequence = simulate(
+        duration_s=14.0, rate_hz=10.0, seed=7, cameras=2, flight=flight, tracks={"features": 60}
+    )
+    result = run(
+        sequence, load_config(algorithm=algorithm, overrides=["final_ba.enabled=false", BELIEVED])
+    )
     truth, history = sequence.groundtruth(), result.history
     assert truth is not None
     assert truth.velocities is not None
@@ -266,7 +271,7 @@ def test_a_stop_during_a_flight_loses_nothing(algorithm: str) -> None:
     sigma = np.sqrt(np.trace(history.pose_covariances()[:, 3:, 3:], axis1=1, axis2=2))
     seconds = (trajectory.stamps_ns - truth.stamps_ns[0]) * 1e-9
     stopped = (np.linalg.norm(truth.velocities[rows], axis=1) < 1e-6) & (seconds > 8.0)
-    assert np.sum(stopped) > 60
+    assert np.sum(stopped) > 30, "three seconds"
     before = int(np.flatnonzero(stopped)[0]) - 1
     assert np.max(error[stopped]) < error[before] + 0.01
     assert np.max(sigma[stopped]) < 1.5 * sigma[before] + 0.01

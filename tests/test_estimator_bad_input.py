@@ -28,7 +28,7 @@ FALGORITHM = Flight()
 RIG = rig(2)
 SURE = np.array([0.01, 0.01, 0.01, 0.05, 0.005])
 ALGORITHM = load_config().algorithm
-GIVEN = BackendConfig(initialization=InitializationConfig(mode="given"))
+GIVEN = BackendConfig(initialization=InitializationConfig(mode="given", check_calibration=False))
 
 
 @pytest.fixture(scope="module")

@@ -46,14 +46,14 @@ def test_the_wheels_tracks(data_dir: Path, algorithm: str) -> None:
     assert rmse(sequence, result, "se3", "trans_part") <= 0.020
 
 
+@pytest.mark.slow
 @pytest.mark.data
 @pytest.mark.parametrize(
     ("algorithm", "cameras", "seconds", "position_m", "angle_deg"),
     [
-        slow("msckf", 1, 30.0, 0.019, 0.21),
-        ("msckf", 2, 15.0, 0.015, 0.19),
-        slow("msckf", 2, 30.0, 0.015, 0.19),
-        slow("swf", 2, 30.0, 0.015, 0.19),
+        ("msckf", 1, 30.0, 0.019, 0.21),
+        ("msckf", 2, 30.0, 0.015, 0.19),
+        ("swf", 2, 30.0, 0.015, 0.19),
     ],
 )
 def test_a_simulation_from_a_given_start(
@@ -64,7 +64,10 @@ def test_a_simulation_from_a_given_start(
     position_m: float,
     angle_deg: float,
 ) -> None:
-    """The first seconds, not aligned: the world is that of the start state."""
+    """The first seconds, not aligned: the world is that of the start state.
+
+    `test_simulation_runs` has a quick one, and `make gate` measures the whole flight.
+    """
     sequence = open_dataset(data_dir / "openvins_sim" / "euroc_V1_01", cameras=cameras)
     result = run(sequence, load_config(overrides=CAUSAL, algorithm=algorithm, duration_s=seconds))
     assert result.status == "ok"
@@ -133,8 +136,14 @@ def test_every_algorithm_gives_positive_definite_covariances(contract_run: RunRe
     assert np.all(np.linalg.eigvalsh(covariances) > 0)
 
 
+@pytest.mark.parametrize(
+    "contract_run", slow_but({"ekf", "okvis"}, algorithm_names()), indirect=True
+)
 def test_every_algorithm_is_deterministic(contract_run: RunResult) -> None:
-    """Two runs give the same states to the last bit; the second one ends soon after take-off."""
+    """Two runs give the same states to the last bit; the second one ends soon after take-off.
+
+    `test_repeats` compares whole runs of other algorithms.
+    """
     algorithm = contract_run.config.algorithm
     again = run(
         open_dataset("demo"), load_config(algorithm=algorithm.name, **{**CONTRACT, "duration_s": 3})

@@ -12,6 +12,7 @@ from typing import Any
 import gtsam
 import numpy as np
 import pytest
+from estimating import BELIEVED
 from flight import FISHEYE, rig
 
 from slam_graph.backend.backend_config import BackendConfig
@@ -198,7 +199,7 @@ def test_frames_belong_to_the_keyframe_next_to_them() -> None:
 
 @pytest.fixture(scope="module")
 def demo() -> RunResult:
-    return run(open_dataset("demo"), load_config(overrides=["duration_s=9"]))
+    return run(open_dataset("demo"), load_config(overrides=["duration_s=9", BELIEVED]))
 
 
 @pytest.mark.slow
@@ -221,7 +222,8 @@ def test_files_and_metrics_hold_it_and_the_causal_estimate_is_as_without(
     demo: RunResult, tmp_path: Path
 ) -> None:
     off = run(
-        open_dataset("demo"), load_config(overrides=["duration_s=9", "final_ba.enabled=false"])
+        open_dataset("demo"),
+        load_config(overrides=["duration_s=9", "final_ba.enabled=false", BELIEVED]),
     )
     for result, folder in ((demo, tmp_path / "on"), (off, tmp_path / "off")):
         result.save(folder)

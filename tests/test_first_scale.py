@@ -8,6 +8,7 @@ from pathlib import Path
 import gtsam
 import numpy as np
 import pytest
+from estimating import BELIEVED
 from gtsam.symbol_shorthand import X
 
 import slam_graph as sg
@@ -106,7 +107,7 @@ def test_a_given_state_that_hovers_before_it_moves(data_dir: Path) -> None:
         seed=1,
         tracks={"features": 80},
     )
-    run = sg.run(sequence, algorithm="swf", overrides=["final_ba.enabled=false"])
+    run = sg.run(sequence, algorithm="swf", overrides=["final_ba.enabled=false", BELIEVED])
     assert run.status == "ok"
     assert len(run.segments) == 1
     assert "start_corrected" not in run.warnings

@@ -5,6 +5,7 @@
 import gtsam
 import numpy as np
 import pytest
+from estimating import BELIEVED
 from gtsam.symbol_shorthand import L, V, X
 
 import slam_graph as sg
@@ -131,7 +132,7 @@ def test_objects_and_map_of_a_run_are_in_the_world_of_its_fixes() -> None:
         objects={"count": 1},
         gnss={"sigma_m": 0.05, "rate_hz": 5.0},
     )
-    wanted = ("objects.enabled=true", "map.enabled=true", "final_ba.enabled=false")
+    wanted = ("objects.enabled=true", "map.enabled=true", "final_ba.enabled=false", BELIEVED)
     run = sg.run(sequence, overrides=[*wanted, "backend.noise.pixel_sigma=0.5"])
     assert run.georeferenced
     assert run.objects is not None
@@ -187,7 +188,7 @@ def test_fixes_turn_the_world_of_an_algorithm_with_damped_steps(
         return moves[-1]
 
     monkeypatch.setattr(Aiding, "in_moved_world", noted)
-    run = sg.run(sequence, algorithm="okvis", overrides=["final_ba.enabled=false"])
+    run = sg.run(sequence, algorithm="okvis", overrides=["final_ba.enabled=false", BELIEVED])
     assert run.status == "ok"
     assert len(run.segments) == 1
     assert moves

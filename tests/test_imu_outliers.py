@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from estimating import BELIEVED
 from groups import slow
 
 from slam_graph.config import load_config
@@ -102,7 +103,7 @@ def test_a_block_of_shaking_is_no_spike(flown: ImuData) -> None:
 @cache
 def error_m(*faults: str) -> float:
     """Of a run that ends well."""
-    config = load_config(algorithm="msckf", overrides=["final_ba.enabled=false"])
+    config = load_config(algorithm="msckf", overrides=["final_ba.enabled=false", BELIEVED])
     sequence = inject(
         simulate(trajectory="figure8", cameras=2, duration_s=13.0, rate_hz=10.0), faults
     )

@@ -7,6 +7,7 @@ from pathlib import Path
 import gtsam
 import numpy as np
 import pytest
+from estimating import BELIEVED
 from groups import slow
 from gtsam.symbol_shorthand import X
 from recordings import FRAME_PERIOD_NS, START_NS
@@ -208,7 +209,13 @@ def estimated(
 ) -> RunResult:
     """A run with a start of its own."""
     backend = {"known_poses": SENSOR}
-    return run(sequence, algorithm=algorithm, backend=backend, final_ba={"enabled": smoothed})
+    return run(
+        sequence,
+        algorithm=algorithm,
+        backend=backend,
+        final_ba={"enabled": smoothed},
+        overrides=[BELIEVED],
+    )
 
 
 def error_m(sequence: SimulatedSequence, result: RunResult) -> float:

@@ -10,6 +10,7 @@ from pathlib import Path
 import gtsam
 import numpy as np
 import pytest
+from estimating import BELIEVED
 
 from slam_graph.arrays import IntArray
 from slam_graph.backend.objects.ego_motion import motion_samples
@@ -102,7 +103,7 @@ def flight_of_two(seed: int) -> RunResult:
     sequence = simulate(
         duration_s=6.0, rate_hz=10.0, seed=seed, tracks={"pixel_sigma": 0.5}, objects={"count": 2}
     )
-    changes = {"objects.enabled": True, "backend.noise.pixel_sigma": 0.5}
+    changes = ["objects.enabled=true", "backend.noise.pixel_sigma=0.5", BELIEVED]
     return run(sequence, overrides=changes)
 
 

@@ -8,6 +8,7 @@ from typing import Any
 import gtsam
 import numpy as np
 import pytest
+from estimating import BELIEVED
 
 from slam_graph.arrays import FloatArray
 from slam_graph.backend import BackendConfig, Estimator, RigProjection
@@ -278,8 +279,8 @@ def flight(**objects: Any) -> SimulatedSequence:
 
 
 def estimated(sequence: SimulatedSequence, **options: Any) -> RunResult:
-    changes = {"objects.enabled": True, "backend.noise.pixel_sigma": SIGMA_PX}
-    return run(sequence, overrides={**changes, "final_ba.enabled": False}, **options)
+    changes = ["objects.enabled=true", f"backend.noise.pixel_sigma={SIGMA_PX}", BELIEVED]
+    return run(sequence, overrides=[*changes, "final_ba.enabled=false"], **options)
 
 
 @pytest.fixture(scope="module")

@@ -4,6 +4,7 @@
 
 import numpy as np
 import pytest
+from estimating import BELIEVED
 from flight import Flight, rig, room, scene
 from groups import slow
 
@@ -215,7 +216,7 @@ def test_a_flight_finds_its_noise_and_knows_its_errors(
 ) -> None:
     monkeypatch.setattr(engine_protocol, "PixelNoise", Recorded)
     tree = {"duration_s": 11.0, "seed": 1, "tracks": {"pixel_sigma": sigma_px}}
-    off = ["final_ba.enabled=false", "backend.initialization.fix_gauge=false"]
+    off = ["final_ba.enabled=false", "backend.initialization.fix_gauge=false", BELIEVED]
     config = load_config(name, [*off, "backend.noise.adaptive_pixels=any"])
     result = run(simulate(SimulationConfig.model_validate(tree)), config)
     found = Recorded.last.sigma_px

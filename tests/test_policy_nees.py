@@ -60,7 +60,7 @@ def settings(algorithm: AlgorithmConfig) -> RunConfig:
     tree = {
         "algorithm": algorithm.model_dump(),
         "cameras": CAMERAS,
-        "backend": {"initialization": {"fix_gauge": False}},
+        "backend": {"initialization": {"fix_gauge": False, "check_calibration": False}},
         "final_ba": {"enabled": False},
     }
     return ConfigTree(tree).validated(RunConfig)

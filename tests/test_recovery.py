@@ -10,6 +10,7 @@ from pathlib import Path
 import gtsam
 import numpy as np
 import pytest
+from estimating import BELIEVED
 from groups import slow
 from gtsam.symbol_shorthand import L, X
 
@@ -30,7 +31,7 @@ from slam_graph.results.run_result import RunResult
 from slam_graph.sensors import FeatureFrame, FeatureObservations
 from slam_graph.simulation.simulator import simulate
 
-CAUSAL = ("final_ba.enabled=false",)
+CAUSAL = ("final_ba.enabled=false", BELIEVED)
 FAULT_S, BLIND_S = 6.0, 3.0
 
 
@@ -264,7 +265,7 @@ def test_a_segment_somewhere_else_is_not_joined_and_places_join_it(tmp_path: Pat
 
 @pytest.mark.slow
 def test_worlds_that_are_not_joined_are_smoothed_apart() -> None:
-    result = flown("kidnapped:at_s=6,duration_s=3.7", settings=())
+    result = flown("kidnapped:at_s=6,duration_s=3.7", settings=(BELIEVED,))
     assert [segment.joined_by for segment in result.segments] == ["start", "none"]
     assert result.smoothed is not None
     for segment in result.segments:

@@ -13,6 +13,7 @@ from typing import cast
 import gtsam
 import numpy as np
 import pytest
+from estimating import BELIEVED
 from flight import rig
 from groups import slow
 from map_flights import World
@@ -113,7 +114,7 @@ def watched(tmp_path_factory: pytest.TempPathFactory) -> tuple[RunResult, Conten
     logger = logging.getLogger("slam_graph")
     level = logger.level
     logger.setLevel(logging.INFO)  # as the command line has it
-    result = sg.run(sequence, viewer=viewer)
+    result = sg.run(sequence, viewer=viewer, overrides=[BELIEVED])
     logger.setLevel(level)
     assert not result.warnings["viewer_failed"]
     return result, content(path)

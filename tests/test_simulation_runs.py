@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from estimating import BELIEVED
 from test_datasets_contract import check_contract, same_frame, same_imu
 from typer.testing import CliRunner
 
@@ -142,7 +143,7 @@ def test_an_interrupted_simulation_leaves_nothing_behind(
 
 
 def ate(sequence: SimulatedSequence) -> float:
-    given = ["backend.initialization.mode=given", "final_ba.enabled=false"]
+    given = ["backend.initialization.mode=given", "final_ba.enabled=false", BELIEVED]
     result = run(sequence, load_config(algorithm="msckf", overrides=given))
     result.check()
     assert result.start_was_given

@@ -9,6 +9,7 @@ from pathlib import Path
 import gtsam
 import numpy as np
 import pytest
+from estimating import BELIEVED
 from gtsam.symbol_shorthand import B, V, X
 
 from benchmarks.policy_product import FLIGHT
@@ -232,7 +233,9 @@ def test_between_keyframes_errors_are_interpolated_and_the_imu_adds_a_bridge() -
 def flown(seed: int) -> RunResult:
     """A run on a simulated flight with stereo cameras, and exactly the noise that is assumed."""
     (source,) = find_sources(["sim:figure8"], DURATION_S, FLIGHT)
-    return run(source.open(seed, 2), load_config(algorithm="msckf", overrides=["cameras=2"]))
+    return run(
+        source.open(seed, 2), load_config(algorithm="msckf", overrides=["cameras=2", BELIEVED])
+    )
 
 
 @pytest.fixture(scope="module")

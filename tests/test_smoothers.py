@@ -8,6 +8,7 @@ from pathlib import Path
 import gtsam
 import numpy as np
 import pytest
+from estimating import BELIEVED
 from flight import FISHEYE, RADTAN, Flight, rig, room, scene
 from groups import slow
 from gtsam.symbol_shorthand import B, L, V, X
@@ -107,7 +108,7 @@ def test_a_drive_with_an_imu_and_fixes_of_a_metre(name: str) -> None:
         tracks={"features": 40},
         gnss={"sigma_m": 1.0, "rate_hz": 2.0},
     )
-    told = load_config(overrides=["final_ba.enabled=false"], algorithm=name)
+    told = load_config(overrides=["final_ba.enabled=false", BELIEVED], algorithm=name)
     result = run(drive, told)
     assert result.status == "ok"
     assert len(result.segments) == 1

@@ -3,6 +3,7 @@
 """What covariances after a start in motion are relative to: the first state that is reported."""
 
 import numpy as np
+from estimating import BELIEVED
 from flight import Flight
 from gtsam.symbol_shorthand import X
 
@@ -54,6 +55,7 @@ def test_after_a_start_in_motion_errors_are_relative_to_the_first_state() -> Non
             "cameras=1",
             "final_ba.enabled=false",
             "backend.initialization.mode=motion",
+            BELIEVED,
         ],
     )
     means = []
@@ -62,6 +64,7 @@ def test_after_a_start_in_motion_errors_are_relative_to_the_first_state() -> Non
             trajectory="figure8",
             cameras=1,
             duration_s=6.0,
+            rate_hz=10.0,
             flight={"hover_s": 0.0},
             seed=seed,
         )

@@ -8,13 +8,14 @@ from pathlib import Path
 import gtsam
 import numpy as np
 import pytest
+from estimating import BELIEVED
 
 import slam_graph as sg
 from slam_graph.backend.initialization.take_off import RETRY_S, TakeOff, retry_s, tells_scale
 from slam_graph.evaluation import nees_of_run
 from slam_graph.simulation.simulated_sequence import SimulatedSequence
 
-STATIC = ["backend.initialization.mode=static"]
+STATIC = ["backend.initialization.mode=static", BELIEVED]
 
 
 def error_and_nees(sequence: SimulatedSequence) -> tuple[float, float]:

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 import pytest
+from estimating import BELIEVED
 from flight import Flight, rig, room, scene
 from groups import slow
 from gtsam.symbol_shorthand import X
@@ -178,7 +179,7 @@ def test_a_flight_finds_its_drift_and_knows_its_errors(
     for on in (True, False):
         overrides = [f"adaptive_drift={on and learns}", f"drift_px={0.2 * (on and not learns)}"]
         overrides = [f"backend.noise.{override}" for override in overrides]
-        result = run(recording, load_config(name, ["final_ba.enabled=false", *overrides]))
+        result = run(recording, load_config(name, ["final_ba.enabled=false", BELIEVED, *overrides]))
         assert result.groundtruth is not None
         errors = nees_of_run(result.groundtruth, result.history, False, None)[0]
         found[on] = np.mean(errors.position), np.mean(errors.orientation)

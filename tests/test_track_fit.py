@@ -7,6 +7,7 @@ from collections.abc import Callable
 import gtsam
 import numpy as np
 import pytest
+from estimating import BELIEVED
 
 from slam_graph.arrays import FloatArray
 from slam_graph.backend.cost.track_fit import Fit, TrackFit
@@ -121,7 +122,7 @@ def driven(seed: int, duration_s: float) -> RecordedSequence:
 
 def test_what_fixes_correct_is_no_contradiction() -> None:
     """Poses that were reported jump by decimetres with each of the first fixes."""
-    result = run(driven(6, 11.0), overrides=["final_ba.enabled=false"])
+    result = run(driven(6, 11.0), overrides=["final_ba.enabled=false", BELIEVED])
     assert result.status == "ok"
     assert result.georeferenced
     assert len(result.segments) == 1

@@ -8,6 +8,7 @@ from pathlib import Path
 import gtsam
 import numpy as np
 import pytest
+from estimating import BELIEVED
 from flight import GRAVITY, Flight, rig, room
 from groups import slow_but
 from numpy.typing import NDArray
@@ -262,7 +263,7 @@ def test_a_run_uses_the_edge_of_a_fisheye(tmp_path: Path) -> None:
     assert isinstance(frame, FeatureFrame)
     length = np.linalg.norm(frame.cameras[0].normalized, axis=1)
     assert np.mean(length > np.tan(np.deg2rad(70))) > 0.2
-    result = run(sequence, algorithm="msckf", overrides=["final_ba.enabled=false"])
+    result = run(sequence, algorithm="msckf", overrides=["final_ba.enabled=false", BELIEVED])
     result.check()
     assert result.metrics["accuracy"]["yaw"]["ate"]["translation_m"]["rmse"] < 0.0125
 

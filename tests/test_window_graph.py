@@ -54,7 +54,7 @@ def steps(
 ) -> Iterator[Estimator]:
     """An estimator after each frame of a noisy flight of 1.6 s, with a share of wrong pixels."""
     config = BackendConfig(
-        initialization=InitializationConfig(mode="given"),
+        initialization=InitializationConfig(mode="given", check_calibration=False),
         calibration=calibration or CalibrationConfig(),
         noise=noise or NoiseConfig(),
     )

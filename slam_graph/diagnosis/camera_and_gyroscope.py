@@ -121,9 +121,16 @@ def refine(rig: Rig, parts: list[Part]) -> CameraAndGyroscope:
         now.fit = problem.solve(start)
     except np.linalg.LinAlgError:
         return now
-    if not _calibration_is_better(problem, start, now.fit):
+    if not (_shows_faults(now, now.fit) and _calibration_is_better(problem, start, now.fit)):
         judge(now, now.fit)
     return now
+
+
+def _shows_faults(now: CameraAndGyroscope, fit: RotationFit) -> bool:
+    """Whether a fit shows anything wrong; only then the calibration is compared with it."""
+    tried = replace(now, findings=[])
+    judge(tried, fit)
+    return any(finding.severity != "info" for finding in tried.findings)
 
 
 def _calibration_is_better(problem: RotationProblem, start: Kinematics, fit: RotationFit) -> bool:

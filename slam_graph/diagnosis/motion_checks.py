@@ -28,6 +28,8 @@ _LEAST_VARIATION = 0.25
 """Standard deviation of the specific force in the world, m/s², of a window that shows something."""
 _QUICK = 3
 """Windows by which all axes are compared at first."""
+_LEFT = 16
+"""So many of them are left after the first window; the best four of all were within nine there."""
 _COMPARED = 4
 """So many of the best axes are compared by a full solution."""
 _CLEARER = 1.12
@@ -114,9 +116,9 @@ def _axes(windows: list[Window]) -> tuple[FloatArray, list[Finding]]:
     """How the accelerometer's axes should be read (3, 3), and a finding if not as they are."""
     nominal = [window.solve(np.eye(3)) for window in windows]
     candidates = [P for handed in (1, -1) for P in signed_permutations(handed)]
-    quick = {k: _score(windows[:_QUICK], P, 0) for k, P in enumerate(candidates)}
-    best = sorted(quick, key=lambda k: quick[k])[:_COMPARED]
-    solved = {k: [window.solve(candidates[k], 8) for window in windows] for k in best}
+    best = _likeliest(windows[:_QUICK], candidates)
+    solved = {k: [window.solve(candidates[k]) for window in windows] for k in best if k > 0}
+    solved |= {0: nominal} if 0 in best else {}  # the plainest
     k = min(best, key=lambda k: _score_of(solved[k]))
     P, score, usual = candidates[k], _score_of(solved[k]), _score_of(nominal)
     # wrong axes spoil every window; a single one may end in a wrong minimum under right ones,
@@ -139,8 +141,18 @@ def _axes(windows: list[Window]) -> tuple[FloatArray, list[Finding]]:
     return P, [finding if len(windows) > 1 else replace(finding, sure="hint")]
 
 
-def _score(windows: list[Window], P: FloatArray, steps: int) -> float:
-    return _score_of([window.solve(P, steps) for window in windows])
+def _likeliest(windows: list[Window], candidates: list[FloatArray]) -> list[int]:
+    """Numbers of the axes (3, 3) that fit best by linear solutions, the best first.
+
+    The first window leaves a few of them to be compared by the others.
+    """
+    solved: dict[int, list[WindowSolution | None]] = {k: [] for k in range(len(candidates))}
+    for window in windows:
+        for k, solutions in solved.items():
+            solutions.append(window.solve(candidates[k], 0))
+        ordered = sorted(solved, key=lambda k: _score_of(solved[k]))
+        solved = {k: solved[k] for k in ordered[:_LEFT]}
+    return list(solved)[:_COMPARED]
 
 
 def _score_of(solutions: list[WindowSolution | None]) -> float:

@@ -17,7 +17,7 @@ from functools import cached_property
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from slam_graph.arrays import FloatArray, IntArray
+from slam_graph.arrays import FloatArray, IntArray, median
 from slam_graph.diagnosis.gyroscope import Gyroscope
 from slam_graph.diagnosis.kinematics import Kinematics
 from slam_graph.sensors import FeatureFrame, Rig
@@ -39,6 +39,9 @@ _LEAST_NOISE_PX = 0.3
 _TINY = 1e-9
 _V, _G, _B, _S = slice(0, 3), slice(3, 6), slice(6, 9), 9
 """Places of the unknowns."""
+_EYE = _TINY * np.eye(10)
+_PRIOR = np.diag([0.0] * 3 + [_GRAVITY_SIGMA**-2] * 3 + [_BIAS_SIGMA**-2] * 3 + [0.0])
+"""Information about the unknowns that is assumed, but for the baseline."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -139,8 +142,9 @@ class Window:
             except np.linalg.LinAlgError:
                 return None
             seen, depth = self._projected(points, x, alpha)
-            size = np.linalg.norm(seen - self._m, axis=1) * self._focal_px
-            sigma_px = max(float(np.median(size)) / _MEDIAN_OF_TWO, _LEAST_NOISE_PX)
+            off = seen - self._m
+            size = np.sqrt(off[:, 0] ** 2 + off[:, 1] ** 2) * self._focal_px
+            sigma_px = max(float(median(size)) / _MEDIAN_OF_TWO, _LEAST_NOISE_PX)
             if iteration == last:
                 break
             noise = sigma_px / self._focal_px
@@ -203,15 +207,15 @@ class Window:
         rows *= (weights / noise)[:, None, None]
         by_feature = np.add.reduceat(rows[..., :3].swapaxes(1, 2) @ rows, self._first, axis=0)
         H_ff, H_fr = by_feature[..., :3], by_feature[..., 3:]
-        size = np.trace(H_ff, axis1=1, axis2=2)[:, None, None]
-        of_features = np.linalg.solve(H_ff + _TINY * (size + 1.0) * np.eye(3), H_fr)
+        size = H_ff[:, 0, 0] + H_ff[:, 1, 1] + H_ff[:, 2, 2]
+        H_ff[:, range(3), range(3)] += _TINY * (size[:, None] + 1.0)
+        of_features = np.linalg.solve(H_ff, H_fr)
         rest = rows[..., 3:].reshape(-1, 11)
         reduced = rest.T @ rest - H_fr.reshape(-1, 11).T @ of_features.reshape(-1, 11)
-        prior = np.diag([0.0] * 3 + [_GRAVITY_SIGMA**-2] * 3 + [_BIAS_SIGMA**-2] * 3)
-        prior = np.pad(prior, (0, 1))
+        prior = _PRIOR.copy()
         prior[_S, _S] = expected[1] ** -2
         likely = np.concatenate([np.zeros(3), -expected[0], np.zeros(3), [1.0]])
-        covariance = np.linalg.inv(reduced[:10, :10] + prior + _TINY * np.eye(10))
+        covariance = np.linalg.inv(reduced[:10, :10] + prior + _EYE)
         x = covariance @ (reduced[:10, 10] + prior @ likely)
         return x, covariance, of_features[..., 10] - of_features[..., :10] @ x
 

@@ -29,26 +29,53 @@ _LEAST_SQUARE = 1e-6
 """Least squared length of a normal that weights are divided by."""
 
 
+_Vector = tuple[float, float, float]
+_Normals = tuple[_Vector, _Vector, _Vector, _Vector, _Vector]
+"""n and its derivatives by the four coordinates: tuples stay in registers, arrays do not."""
+
+
 @compiled()
-def _fill_normals(
+def _cross(a: _Vector, b: _Vector) -> _Vector:
+    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+
+
+@compiled()
+def _dot(a: _Vector, b: _Vector) -> float:
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+@compiled()
+def _normals_of(
     one: FloatArray,
     two: FloatArray,
     by_one: FloatArray,
     by_two: FloatArray,
     R: FloatArray,
-    normals: FloatArray,
-) -> None:
-    """Fill n and its four derivatives, (5, 3), of a feature."""
-    for c in range(3):
-        a, b = (c + 1) % 3, (c + 2) % 3
-        turned_a = R[a, 0] * two[0] + R[a, 1] * two[1] + R[a, 2] * two[2]
-        turned_b = R[b, 0] * two[0] + R[b, 1] * two[1] + R[b, 2] * two[2]
-        normals[0, c] = one[a] * turned_b - one[b] * turned_a
-        for k in range(2):
-            normals[1 + k, c] = by_one[k, a] * turned_b - by_one[k, b] * turned_a
-            by_a = R[a, 0] * by_two[k, 0] + R[a, 1] * by_two[k, 1] + R[a, 2] * by_two[k, 2]
-            by_b = R[b, 0] * by_two[k, 0] + R[b, 1] * by_two[k, 1] + R[b, 2] * by_two[k, 2]
-            normals[3 + k, c] = one[a] * by_b - one[b] * by_a
+    p: int,
+    n: int,
+) -> _Normals:
+    """The normal of feature n in pair p, and its derivatives by the pixels."""
+    x, y, z = (
+        (R[p, 0, 0], R[p, 0, 1], R[p, 0, 2]),
+        (R[p, 1, 0], R[p, 1, 1], R[p, 1, 2]),
+        (R[p, 2, 0], R[p, 2, 1], R[p, 2, 2]),
+    )
+    f = one[p, n, 0], one[p, n, 1], one[p, n, 2]
+    of_u = by_one[p, n, 0, 0], by_one[p, n, 0, 1], by_one[p, n, 0, 2]
+    of_v = by_one[p, n, 1, 0], by_one[p, n, 1, 1], by_one[p, n, 1, 2]
+    g = two[p, n, 0], two[p, n, 1], two[p, n, 2]
+    turned = _dot(x, g), _dot(y, g), _dot(z, g)
+    g = by_two[p, n, 0, 0], by_two[p, n, 0, 1], by_two[p, n, 0, 2]
+    by_u = _dot(x, g), _dot(y, g), _dot(z, g)
+    g = by_two[p, n, 1, 0], by_two[p, n, 1, 1], by_two[p, n, 1, 2]
+    by_v = _dot(x, g), _dot(y, g), _dot(z, g)
+    return (
+        _cross(f, turned),
+        _cross(of_u, turned),
+        _cross(of_v, turned),
+        _cross(f, by_u),
+        _cross(f, by_v),
+    )
 
 
 @compiled(
@@ -82,27 +109,23 @@ def epipolar_distances(
         slopes: (P, N, 3), filled: derivatives of the distances by t, for a variance that depends on
             t also where it is `least`; (0, 0, 0) to leave them out.
     """
-    normals, along = np.empty((5, 3)), np.empty(5)
     for p in range(len(t)):
-        x, y, z = t[p, 0], t[p, 1], t[p, 2]
+        direction = t[p, 0], t[p, 1], t[p, 2]
         for n in range(one.shape[1]):
-            _fill_normals(one[p, n], two[p, n], by_one[p, n], by_two[p, n], R[p], normals)
-            variance = 0.0
-            for k in range(5):
-                along[k] = x * normals[k, 0] + y * normals[k, 1] + z * normals[k, 2]
-            for k in range(1, 5):
-                variance += along[k] * along[k]
+            normal, a, b, c, d = _normals_of(one, two, by_one, by_two, R, p, n)
+            by_a, by_b = _dot(direction, a), _dot(direction, b)
+            by_c, by_d = _dot(direction, c), _dot(direction, d)
+            variance = by_a * by_a + by_b * by_b + by_c * by_c + by_d * by_d
             variance = max(variance, least[p, n])
             sigma = math.sqrt(variance)
-            distance = along[0] / sigma
+            distance = _dot(direction, normal) / sigma
             distances[p, n], sigmas[p, n] = distance, sigma
             if len(slopes) == 0:
                 continue
-            for c in range(3):
-                half = 0.0  # of the derivative of the variance
-                for k in range(1, 5):
-                    half += along[k] * normals[k, c]
-                slopes[p, n, c] = normals[0, c] / sigma - half * distance / variance
+            for k in range(3):
+                # half of the derivative of the variance
+                half = by_a * a[k] + by_b * b[k] + by_c * c[k] + by_d * d[k]
+                slopes[p, n, k] = normal[k] / sigma - half * distance / variance
 
 
 @compiled(
@@ -134,28 +157,30 @@ def epipolar_moments(
         moments: (P, 3, 3), filled: sums of w n nᵀ less those of `by_noise` cov(n), for pixels with
             unit noise.
     """
-    normals = np.empty((5, 3))
     for p in range(len(R)):
-        for a in range(3):
-            for b in range(3):
-                moments[p, a, b] = 0.0
+        xx = xy = xz = yy = yz = zz = 0.0
         for n in range(one.shape[1]):
             weight, noise = weights[p, n], by_noise[p, n]
             if weight == 0.0 and noise == 0.0:
                 continue
-            _fill_normals(one[p, n], two[p, n], by_one[p, n], by_two[p, n], R[p], normals)
+            (x, y, z), a, b, c, d = _normals_of(one, two, by_one, by_two, R, p, n)
             if normalize:
-                square = normals[0, 0] * normals[0, 0] + normals[0, 1] * normals[0, 1]
-                weight /= max(square + normals[0, 2] * normals[0, 2], _LEAST_SQUARE)
-            for a in range(3):
-                for b in range(a, 3):
-                    spread = 0.0
-                    for k in range(1, 5):
-                        spread += normals[k, a] * normals[k, b]
-                    moments[p, a, b] += weight * normals[0, a] * normals[0, b] - noise * spread
-        for a in range(3):
-            for b in range(a):
-                moments[p, a, b] = moments[p, b, a]
+                weight /= max(x * x + y * y + z * z, _LEAST_SQUARE)
+            spread = a[0] * a[0] + b[0] * b[0] + c[0] * c[0] + d[0] * d[0]
+            xx += weight * x * x - noise * spread
+            spread = a[0] * a[1] + b[0] * b[1] + c[0] * c[1] + d[0] * d[1]
+            xy += weight * x * y - noise * spread
+            spread = a[0] * a[2] + b[0] * b[2] + c[0] * c[2] + d[0] * d[2]
+            xz += weight * x * z - noise * spread
+            spread = a[1] * a[1] + b[1] * b[1] + c[1] * c[1] + d[1] * d[1]
+            yy += weight * y * y - noise * spread
+            spread = a[1] * a[2] + b[1] * b[2] + c[1] * c[2] + d[1] * d[2]
+            yz += weight * y * z - noise * spread
+            spread = a[2] * a[2] + b[2] * b[2] + c[2] * c[2] + d[2] * d[2]
+            zz += weight * z * z - noise * spread
+        moments[p, 0, 0], moments[p, 0, 1], moments[p, 0, 2] = xx, xy, xz
+        moments[p, 1, 0], moments[p, 1, 1], moments[p, 1, 2] = xy, yy, yz
+        moments[p, 2, 0], moments[p, 2, 1], moments[p, 2, 2] = xz, yz, zz
 
 
 def epipolar_distances_numpy(

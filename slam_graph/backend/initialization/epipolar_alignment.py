@@ -291,6 +291,7 @@ def align_by_epipolar_errors(
     imu: ImuBuffer,
     coarse: GyroAlignment | None,
     mounted: bool,
+    near_s: float | None = None,
 ) -> GyroAlignment | None:
     """Time offset, bias and, where it is not known, mounting.
 
@@ -301,6 +302,7 @@ def align_by_epipolar_errors(
         imu: samples so far.
         coarse: the same by rotations of two views each; needed for an unknown mounting.
         mounted: whether the rotation of the camera on the body is known.
+        near_s: offset that was found a few seconds ago; it is looked for around it at first.
 
     Returns:
         None if frames are too few, or the cost has no minimum within the range.
@@ -317,11 +319,12 @@ def align_by_epipolar_errors(
         start = problem.minimized(start, _BIAS, 3)[0]
     elif coarse is not None:
         start = _mounted(problem, coarse)
-    steps = round(MAX_OFFSET_S / _COARSE_S)
-    grid = nominal_s + _COARSE_S * np.arange(-steps, steps + 1)
-    costs = [problem.equations(replace(start, offset_s=s)).least_cost(columns) for s in grid]
-    best = int(np.argmin(costs))
-    if not 0 < best < len(grid) - 1:
+    for grid in _grids(nominal_s, near_s):
+        costs = [problem.equations(replace(start, offset_s=s)).least_cost(columns) for s in grid]
+        best = int(np.argmin(costs))
+        if 0 < best < len(grid) - 1:
+            break
+    else:
         return None
     found = replace(start, offset_s=float(grid[best]))
     unknowns = _OFFSET if mounted else _ALL
@@ -339,6 +342,16 @@ def align_by_epipolar_errors(
         problem = _problem(frames, moved, pixel_sigma, imu, mounted=True) or problem
         found, least = problem.minimized(found, unknowns)
     return _with_curvature(problem, found, least, columns, margin)
+
+
+def _grids(nominal_s: float, near_s: float | None) -> list[FloatArray]:
+    """Offsets at which the cost is found first, s: around one that is near, and all of them."""
+    steps = round(MAX_OFFSET_S / _COARSE_S)
+    grid = nominal_s + _COARSE_S * np.arange(-steps, steps + 1, dtype=np.float64)
+    if near_s is None:
+        return [grid]
+    middle = int(np.argmin(np.abs(grid - near_s)))
+    return [grid[max(middle - 2, 0) : middle + 3], grid]
 
 
 def _mounted(problem: _Problem, coarse: GyroAlignment) -> _Guess:

@@ -35,8 +35,13 @@ _SPACING_NS, _LATER_SPACING_NS = 45_000_000, 360_000_000
 """Smallest time between two frames that are used, at the start and later."""
 _LATER_TURNS = 10
 """Fewest rotations for a test of the clock later."""
-_REFINED_NS = 1_300_000_000
-"""Time between two estimates by epipolar errors, which take longer."""
+_REFINED_NS, _SELDOM_NS = 1_300_000_000, 4_000_000_000
+"""Time between two estimates by epipolar errors, which take longer, and that after one which is so
+near to the calibration that it would hardly be corrected: the next one has other frames then."""
+_NEAR_S, _SETTLED_S, _NEAR_SIGMAS = 16e-3, 8e-3, 2.5
+"""An estimate is near if it is within the first of the calibration, its standard deviation counted
+so many times. Within the second no other by epipolar errors could correct the calibration: they
+are seldom known to 1 ms, and `_ADOPTED_SIGMAS` of that are needed."""
 _RESTS_RAD_S = 0.05
 """The platform turns too little for an estimate by epipolar errors where the standard deviation of
 the angular rate is below this."""
@@ -105,7 +110,8 @@ class StartCalibration:
         self._turns = VisualTurns(self._camera, config.noise.pixel_sigma)
         self._pause_ns = _LATER_PAUSE_NS
         self._next_ns: int | None = None  # of the next comparison; None: at once
-        self._refined_ns = np.iinfo(np.int64).min // 2
+        self._refined_ns: int | None = None  # of the last estimate by epipolar errors
+        self._last: GyroAlignment | None = None  # this estimate, if it has found anything
         self._doubted_ns: int | None = None  # since when the clock seems to have changed
         self._checks = config.initialization.check_calibration
         self._monitor = ClockMonitor(self._camera) if self.mounted else None
@@ -117,7 +123,7 @@ class StartCalibration:
         self._turns.forget()
         self.recent.clear()
         self._static.clear()
-        self._doubted_ns = None
+        self._doubted_ns = self._next_ns = self._refined_ns = self._last = None
 
     def needed_since_ns(self, stamp_ns: int) -> int:
         """The earlier one of a time and the first frame to begin anew from, if there is one."""
@@ -161,7 +167,7 @@ class StartCalibration:
         found = align_gyroscope(*covered, R, self._camera.clock_offset_s)
         margin = CLEAR if started else _CLEAR_WAITING
         if found is None or not (found.is_clear(margin) and self._fits(found)):
-            found = self._refined(found, margin, frame, imu)
+            found = self._refined(found, margin, frame, imu, started)
         if found is None or not found.is_clear(margin):
             return None
         change = None if monitor is None else monitor.compare(found, covered, imu)
@@ -176,7 +182,12 @@ class StartCalibration:
         return self._judged(found, _ADOPTED_SIGMA_S if started else _WAITING_SIGMA_S)
 
     def _refined(
-        self, coarse: GyroAlignment | None, margin: float, frame: FeatureFrame, imu: ImuBuffer
+        self,
+        coarse: GyroAlignment | None,
+        margin: float,
+        frame: FeatureFrame,
+        imu: ImuBuffer,
+        started: bool,
     ) -> GyroAlignment | None:
         """The more certain of two estimates: by rotations of two views, and by epipolar errors.
 
@@ -185,25 +196,54 @@ class StartCalibration:
             margin: with which a minimum is clear.
             frame: the newest one.
             imu: samples so far.
+            started: whether there is a state already.
 
         Returns:
-            None where there is none, or the last one by epipolar errors is too recent.
+            None where there is none that is new.
         """
         if np.linalg.norm(np.std(imu.data.gyro, axis=0)) < _RESTS_RAD_S:
             return coarse
-        if frame.stamp_ns < self._refined_ns + _REFINED_NS:
-            return None
+        clear = coarse if coarse is not None and coarse.is_clear(margin) else None
+        if self._refines_later(frame, clear, started):
+            if clear is None or self._last is None:
+                return clear
+            return clear if _uncertainty(clear) < _uncertainty(self._last) else None
         self._refined_ns = frame.stamp_ns
         seen = self._static, self._camera, self._config.noise.pixel_sigma
-        found = align_by_epipolar_errors(*seen, imu, coarse, self.mounted)
-        if found is None or coarse is None or not coarse.is_clear(margin):
+        last = self._last
+        near_s = last.offset_s if last is not None and last.is_clear() else None
+        found = align_by_epipolar_errors(*seen, imu, coarse, self.mounted, near_s)
+        self._last = found
+        if found is None or clear is None:
             return found
-        return min(found, coarse, key=_uncertainty)
+        return min(found, clear, key=_uncertainty)
+
+    def _refines_later(
+        self, frame: FeatureFrame, clear: GyroAlignment | None, started: bool
+    ) -> bool:
+        """Whether the next estimate by epipolar errors is later than a frame.
+
+        Without a state they are not rare, as a wrong calibration may be what the start waits for.
+        """
+        if self._refined_ns is None:
+            return False
+        pause_ns, last = _REFINED_NS, self._last
+        agrees = clear is None or self._distance_s(clear, -_FITS_SIGMAS) < 0.0
+        agrees |= clear is not None and self._distance_s(clear, 0.0) < _ADOPTED_S
+        if self.mounted and started and agrees and last is not None and last.is_clear():
+            distance_s = self._distance_s(last, _NEAR_SIGMAS)
+            if distance_s < _SETTLED_S:
+                return True
+            pause_ns = _SELDOM_NS if distance_s < _NEAR_S else pause_ns
+        return frame.stamp_ns < self._refined_ns + pause_ns
+
+    def _distance_s(self, found: GyroAlignment, sigmas: float) -> float:
+        """How far the calibrated offset is from an estimate and some of its deviations."""
+        return abs(found.offset_s - self._camera.clock_offset_s) + sigmas * found.offset_sigma_s
 
     def _fits(self, found: GyroAlignment) -> bool:
         """Whether the calibrated offset is known to fit."""
-        sigma_s = found.offset_sigma_s
-        difference_s = abs(found.offset_s - self._camera.clock_offset_s)
+        sigma_s, difference_s = found.offset_sigma_s, self._distance_s(found, 0.0)
         return self.mounted and difference_s < _FITS_SIGMAS * sigma_s and sigma_s < _FITS_SIGMA_S
 
     def _waits(self, frame: FeatureFrame) -> bool:
