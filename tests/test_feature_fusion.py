@@ -15,7 +15,7 @@ import pytest
 from slam_graph.backend.backend_config import BackendConfig
 from slam_graph.backend.cost.feature_tracks import Observations
 from slam_graph.backend.cost.reprojection import Geometry, RigProjection
-from slam_graph.backend.smoothing import final_adjustment
+from slam_graph.backend.smoothing import segment_adjustment
 from slam_graph.backend.smoothing.final_adjustment import adjust_recording
 from slam_graph.backend.smoothing.frame_log import FrameLog
 from slam_graph.backend.smoothing.keyframe_states import states_at
@@ -257,7 +257,7 @@ def test_tracks_are_adjusted_as_they_are_if_fusion_fails(
     def refuse(*_: object) -> None:
         raise EstimationError("no minimum")
 
-    monkeypatch.setattr(final_adjustment, "with_fused_features", refuse)
+    monkeypatch.setattr(segment_adjustment, "with_fused_features", refuse)
     few = {"max_iterations": 2}
     found = adjusted(FinalBaConfig(**few))
     plain = adjusted(FinalBaConfig(fuse_features=False, **few))

@@ -37,14 +37,14 @@ def given(rig: Rig, change: str) -> Rig:
 
 
 @cache
-def flight() -> RecordedSequence:
-    return simulate(trajectory="figure8", cameras=1, duration_s=14.0, seed=4)
+def flight(rate_hz: float = 10.0) -> RecordedSequence:
+    return simulate(trajectory="figure8", cameras=1, duration_s=14.0, rate_hz=rate_hz, seed=4)
 
 
 @cache
-def adjusted(change: str) -> RunResult:
+def adjusted(change: str, *settings: str, rate_hz: float = 10.0) -> RunResult:
     """The run of a flight with one camera, whose calibration has a fault."""
-    sequence = flight()
+    sequence = flight(rate_hz)
     packets = list(sequence.packets())
     imu = ImuData.concatenate([packet.imu for packet in packets])
     rig = given(sequence.rig, change)
@@ -63,7 +63,7 @@ def adjusted(change: str) -> RunResult:
         features=frames,
         groundtruth=sequence.groundtruth(),
     )
-    return run(recording)
+    return run(recording, overrides=list(settings))
 
 
 def minimum(change: str) -> FinalBa:
@@ -87,11 +87,18 @@ def test_a_right_calibration_is_found_to_be_right() -> None:
     assert np.max(np.abs(off)) < 3.5
     assert np.mean(np.square(off)) < 2.2  # of 11: χ² below this in 99 %
     assert adjusted("right").status == "ok"
+    known = {p.name: p.sigma for p in found.calibration.parameters()}
+    assert known["cam0_rotation_x_rad"] < 0.002  # of the prior: 0.02
+    assert known["time_offset_s"] < 0.001  # of the prior: 0.01
 
 
 @pytest.mark.parametrize(
     ("change", "said"),
-    [("turned", "cam0 is turned by"), ("longer", "the focal lengths of cam0")],
+    [
+        ("turned", "cam0 is turned by"),
+        ("longer", "the focal lengths of cam0"),
+        ("late", "the time offset of the cameras is 6."),
+    ],
 )
 def test_a_wrong_one_is_named_and_corrected(change: str, said: str) -> None:
     found = minimum(change)
@@ -102,12 +109,23 @@ def test_a_wrong_one_is_named_and_corrected(change: str, said: str) -> None:
     assert np.rad2deg(np.linalg.norm(gtsam.Rot3.Logmap(turn))) < 0.1 * TURN_DEG
     assert shown.camera.intrinsics == pytest.approx(right.camera.intrinsics, abs=0.9)
     assert error_m(change) < 2.0 * error_m("right")
+    result = adjusted(change)
+    assert result.status == "suspect"
+    assert said in result.message
+    assert "try --set backend.calibration." in result.message
+    assert result.warnings["calibration_off"] == 1
 
 
 def test_a_small_offset_that_is_found_late_loses_nothing() -> None:
-    late, right = (adjusted(change).trajectory for change in ("late", "right"))
-    assert abs(int(late.stamps_ns[0]) - int(right.stamps_ns[0])) < 10_000_000
-    assert adjusted("late").status == "ok"
-    truth = flight().groundtruth()
+    result, truth = adjusted("late", rate_hz=20.0), flight(20.0).groundtruth()
+    assert result.warnings["calibration_corrected"] == 1
     assert truth is not None
-    assert ape(truth, late, alignment="yaw").statistics.rmse < 0.03
+    assert result.trajectory.stamps_ns[0] - truth.stamps_ns[0] < 1_200_000_000
+    assert ape(truth, result.trajectory, alignment="yaw").statistics.rmse < 0.03
+
+
+def test_beside_moving_objects_the_calibration_of_the_run_is_kept() -> None:
+    found = adjusted("turned", "objects.enabled=true").final_ba
+    assert found is not None
+    assert found.calibration_faults
+    assert found.summary.iterations < minimum("turned").summary.iterations

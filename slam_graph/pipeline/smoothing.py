@@ -108,19 +108,16 @@ class Smoothing(Stage):
         found = self._adjusted(log)
         if found is None:
             return
-        first, found = found, self._calibrated(log, found)
         is_apart, causes = self._contradiction(found)
+        consistent = False
         if is_apart:
-            again = self._consistent(log, first)
-            found = again or found
+            again = self._consistent(log, found)
+            consistent, found = again is not None, again or found
             if again is None:
                 self._diagnostics.warn("smoothed_contradicts", "; ".join(causes))
-        if found.calibration_faults:
-            off = "; ".join(fault.what for fault in found.calibration_faults)
-            self._diagnostics.warn(
-                "calibration_off", f"{off}: corrected in the smoothed trajectory"
-            )
         result.final_ba = found  # not one that may contradict, and of which nothing is said yet
+        if found.calibration_faults:
+            result.final_ba = found = self._calibrated(log, found, consistent)
         summary = found.summary
         logger.info(
             "final bundle adjustment: %d keyframes, %d features, %d steps in %.1f s",
@@ -130,29 +127,40 @@ class Smoothing(Stage):
             summary.seconds,
         )
 
-    def _calibrated(self, log: backend.FrameLog, found: backend.FinalBa) -> backend.FinalBa:
-        """The adjustment with the calibration that it shows, where that it had is clearly wrong.
+    def _calibrated(
+        self, log: backend.FrameLog, first: backend.FinalBa, consistent: bool
+    ) -> backend.FinalBa:
+        """The adjustment with the calibration that it shows, as that it had is clearly wrong.
+
+        Loop closure, maps and objects hold what was seen under the calibration of the run, and go
+        with a trajectory under that one.
 
         Args:
             log: all frames.
-            found: the adjustment with the calibration of the run.
+            first: the adjustment with the calibration of the run.
+            consistent: as for `_adjusted`.
         """
-        first = found
-        for _ in range(_CALIBRATIONS):
-            if found.calibration is None or not found.calibration_faults:
+        found, settings = first, self._result.config
+        assert first.calibration is not None
+        nominal = rig = first.calibration.nominal
+        others = settings.objects, settings.loop_closure, settings.map
+        for _ in range(0 if any(other.enabled for other in others) else _CALIBRATIONS):
+            step = replace(found.calibration, nominal=rig) if found.calibration else None
+            if step is None or not replace(found, calibration=step).calibration_faults:
                 break
-            again = None
-            with warn_on_failure(self._diagnostics, "final_ba_failed", _UNCALIBRATED):
-                again = self._adjusted(log, found.calibration.rig)
+            rig, again = step.rig, None
+            with warn_on_failure(self._diagnostics, "calibration_off", _UNCALIBRATED):
+                again = self._adjusted(log, rig, consistent)
             if again is None or again.calibration is None:
                 break
-            logger.info("adjusted again: %s", found.calibration_faults[0].what)
-            found = again
-        if found is first or found.calibration is None or first.calibration is None:
-            return found
-        return replace(
-            found, calibration=replace(found.calibration, nominal=first.calibration.nominal)
-        )
+            found = _with_all_steps(again.about(nominal, settings.backend), found)
+        latest = self._result.logs.calibration.latest
+        estimated = () if latest is None else latest.covariances  # which the run has found itself
+        off = "; ".join(f.what for f in found.calibration_faults if f.variable not in estimated)
+        if off:
+            corrected = "; the smoothed trajectory has it corrected" if found is not first else ""
+            self._diagnostics.warn("calibration_off", off + corrected)
+        return found
 
     def _adjusted(
         self, log: backend.FrameLog, rig: Rig | None = None, consistent: bool = False
@@ -228,3 +236,15 @@ class Smoothing(Stage):
         self._log = None
         with warn_on_failure(self._diagnostics, "final_ba_failed", _FAILED):
             raise error
+
+
+def _with_all_steps(found: backend.FinalBa, before: backend.FinalBa) -> backend.FinalBa:
+    """An adjustment whose summary has the steps and the time of the one before, too."""
+    own, other = found.summary, before.summary
+    summary = replace(
+        own,
+        iterations=own.iterations + other.iterations,
+        seconds=own.seconds + other.seconds,
+        cpu_seconds=own.cpu_seconds + other.cpu_seconds,
+    )
+    return replace(found, summary=summary)

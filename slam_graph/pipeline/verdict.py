@@ -29,6 +29,7 @@ from slam_graph.results import RunResult
 from slam_graph.sensors import FeatureFrame, ImuData, Rig
 
 if TYPE_CHECKING:
+    from slam_graph.backend import FinalBa
     from slam_graph.diagnosis import Diagnosis
 
 _FIRST_LOOK_NS = 5_000_000_000
@@ -177,13 +178,28 @@ class Verdict(Stage):
         )
         result.evidence = asdict(found)
         causes = list(found.causes) if found.contradicts else []
-        if adjusted is not None and not found.agrees:  # what was found has bent the estimate
-            faults = adjusted.calibration_faults[:2]
-            causes = [*(f"{f.what} (try --set {f.setting}=true)" for f in faults), *causes]
+        if adjusted is not None:
+            causes = [*self._calibration_faults(adjusted, found.agrees), *causes]
         unclear = self._diagnostics.counts["world_not_clear"] > 0
         if unclear:
             causes.append(_WORLD_NOT_CLEAR)
-        return found.is_unusual or unclear, causes
+        return found.is_unusual or bool(causes), causes
+
+    def _calibration_faults(self, adjusted: FinalBa, agrees: bool) -> list[str]:
+        """What of the calibration is off by so much that the causal trajectory may be wrong.
+
+        Args:
+            adjusted: the adjustment at the end.
+            agrees: whether it is as near to the causal trajectory as in good runs.
+        """
+        latest = self._result.logs.calibration.latest
+        estimated = () if latest is None else latest.covariances  # which the run has found itself
+        own = self._result.config.algorithm.engine == "square_root"
+        return [
+            f"{fault.what} (try --set {fault.setting}=true)" if own else fault.what
+            for fault in adjusted.calibration_faults
+            if fault.variable not in estimated and (fault.harms or not agrees)
+        ][:2]
 
     def _watch_start(self, stamp_ns: int, rig: Rig) -> None:
         """Look now and then what keeps a run from starting; after a loss at once as well.

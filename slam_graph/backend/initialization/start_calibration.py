@@ -126,8 +126,9 @@ class StartCalibration:
         self._doubted_ns = self._next_ns = self._refined_ns = self._last = None
 
     def needed_since_ns(self, stamp_ns: int) -> int:
-        """The earlier one of a time and the first frame to begin anew from, if there is one."""
-        return min([stamp_ns, *(frame.stamp_ns for frame in islice(self.recent, 1))])
+        """The earlier one of a time and the first frame to begin anew from, on the IMU's clock."""
+        offset_ns = round(self._camera.clock_offset_s * 1e9)
+        return min([stamp_ns, *(f.stamp_ns + offset_ns for f in islice(self.recent, 1))])
 
     def add(
         self, frame: FeatureFrame, imu: ImuBuffer, started: bool, dynamic: IntArray
@@ -201,17 +202,19 @@ class StartCalibration:
         Returns:
             None where there is none that is new.
         """
-        if np.linalg.norm(np.std(imu.data.gyro, axis=0)) < _RESTS_RAD_S:
+        recent = imu.data.stamps_ns > imu.newest_ns() - _RECENT_NS
+        if np.linalg.norm(np.std(imu.data.gyro[recent], axis=0)) < _RESTS_RAD_S:
             return coarse
         clear = coarse if coarse is not None and coarse.is_clear(margin) else None
         if self._refines_later(frame, clear, started):
-            if clear is None or self._last is None:
-                return clear
+            if clear is None or self._last is None:  # the last estimate has found nothing
+                return None
             return clear if _uncertainty(clear) < _uncertainty(self._last) else None
         self._refined_ns = frame.stamp_ns
         seen = self._static, self._camera, self._config.noise.pixel_sigma
-        last = self._last
-        near_s = last.offset_s if last is not None and last.is_clear() else None
+        last, near_s = self._last, None
+        if last is not None and last.is_clear() and self._distance_s(last, _NEAR_SIGMAS) < _NEAR_S:
+            near_s = last.offset_s  # to confirm the calibration; all offsets are tried else
         found = align_by_epipolar_errors(*seen, imu, coarse, self.mounted, near_s)
         self._last = found
         if found is None or clear is None:

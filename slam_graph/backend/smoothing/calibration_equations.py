@@ -12,7 +12,8 @@ costs little. The parameters are those of online calibration: where each camera 
 focal lengths and principal point, and the time offset of all cameras. A camera that moves on the
 body by ξ in its own frame sees what it would see if the body moved by Ad_E ξ, E = body_T_camera;
 one that is late by τ, what it would see if the body had moved on by (ω, v) τ, its angular rate and
-velocity in its own frame.
+velocity in its own frame. Of a rolling shutter the motion to the row of a feature is left out of
+the Jacobians.
 """
 
 from __future__ import annotations
@@ -37,6 +38,8 @@ from slam_graph.sensors import CalibrationEstimate, ImuBuffer, Rig, RigCamera
 
 _SIZES = {"e": 6, "k": 4, "t": 1}
 """Components of a mounting (rotation, translation), of a lens (fx, fy, cx, cy), of the offset."""
+_BLOCK = 20_000
+"""Observations at a time: their Jacobians would take 60 MB for two minutes with two cameras."""
 
 
 def variables_of(rig: Rig) -> dict[str, slice]:
@@ -79,24 +82,26 @@ class CalibrationEquations:
         information = np.sum([part.information for part in parts], axis=0)
         return cls(information, np.sum([part.gradient for part in parts], axis=0))
 
-    def estimate(self, rig: Rig, config: CalibrationConfig, stamp_ns: int) -> CalibrationEstimate:
+    def estimate(
+        self, rig: Rig, config: CalibrationConfig, stamp_ns: int, nominal: Rig | None = None
+    ) -> CalibrationEstimate:
         """The calibration after the step, with its covariance.
 
         Args:
             rig: the calibration that the equations were made with.
             config: prior standard deviations.
             stamp_ns: time of the estimate.
-
-        Raises:
-            LinAlgError: if the equations are not finite.
+            nominal: the calibration that the prior is about; `rig` if not said.
         """
         columns = variables_of(rig)
         prior = np.concatenate([_sigmas(name, rig, config) for name in columns])
         covariance = np.asarray(np.linalg.inv(self.information + np.diag(prior**-2.0)), np.float64)
-        step = covariance @ self.gradient
+        nominal = nominal or rig
+        away = np.concatenate([_difference(name, rig, nominal) for name in columns])
+        step = covariance @ (self.gradient + prior**-2.0 * away)
         moved = _moved(rig, {name: step[own] for name, own in columns.items()})
         blocks = {name: covariance[own, own] for name, own in columns.items()}
-        return CalibrationEstimate(stamp_ns, rig, moved, blocks)
+        return CalibrationEstimate(stamp_ns, nominal, moved, blocks)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -129,23 +134,33 @@ class CalibrationColumns:
             states: that of its states.
         """
         images, keyframes = linear.images, len(linear.chain.gradient)
-        J = self._jacobians(images)
-        width = J.shape[2]
-        T, B = np.empty((3 * len(images.obs.ids), width)), np.zeros((keyframes, STATE, width))
+        width = variables_of(self.rig)["t0"].stop
+        H, g = np.zeros((width, width)), np.zeros(width)
+        by_poses = np.zeros((width, keyframes, 6))
+        by_points = np.zeros((width, len(images.obs.ids), 3))
+        for first in range(0, len(images.obs), _BLOCK):
+            part = images.rows(np.arange(first, min(first + _BLOCK, len(images.obs))))
+            J = self._jacobians(part)
+            for k in range(width):
+                by_pose, by_point = replace(part, r=J[:, :, k]).gradient(keyframes)
+                by_poses[k] += by_pose
+                by_points[k] += by_point
+            rows = J.reshape(-1, width)
+            H += rows.T @ rows
+            g += rows.T @ part.r.ravel()
+        T, B = np.empty((by_points[0].size, width)), np.zeros((keyframes, STATE, width))
         for k in range(width):
-            column = replace(images, r=J[:, :, k])
-            reduced, t = features.reduced(*column.gradient(keyframes))
+            reduced, t = features.reduced(by_poses[k], by_points[k])
             T[:, k], B[:, :6, k] = t.ravel(), reduced
         by_state = linear.chain.gradient.copy()
         reduced, t = features.reduced(*images.gradient(keyframes))
         by_state[:, :6] += reduced
         if linear.fixes is not None and features.fixes is not None:
             by_state[:, :6] += features.fixes.reduced(*linear.fixes.gradient(keyframes))
-        rows, own = J.reshape(-1, width), B.reshape(-1, width)
+        own = B.reshape(-1, width)
         held = states.times_covariance(B).reshape(own.shape)
         return CalibrationEquations(
-            rows.T @ rows - T.T @ T - own.T @ held,
-            rows.T @ images.r.ravel() - T.T @ t.ravel() - held.T @ by_state.ravel(),
+            H - T.T @ T - own.T @ held, g - T.T @ t.ravel() - held.T @ by_state.ravel()
         )
 
     def _jacobians(self, images: LinearReprojection) -> FloatArray:
@@ -172,6 +187,18 @@ def _sigmas(name: str, rig: Rig, config: CalibrationConfig) -> FloatArray:
         return np.repeat([config.rotation_sigma_rad, config.position_sigma_m], 3)
     focal = rig.cameras[int(name[1:])].camera.intrinsics[:2] * config.focal_length_sigma
     return np.append(focal, np.repeat(config.principal_point_sigma_px, 2))
+
+
+def _difference(name: str, rig: Rig, nominal: Rig) -> FloatArray:
+    """The step of a variable from one calibration to another."""
+    number = int(name[1:])
+    one, other = rig.cameras[number], nominal.cameras[number]
+    if name.startswith("t"):
+        return np.array([other.time_offset_s - one.time_offset_s])
+    if name.startswith("e"):
+        step = one.body_T_camera.localCoordinates(other.body_T_camera)
+        return np.asarray(step, dtype=np.float64)
+    return other.camera.intrinsics - one.camera.intrinsics
 
 
 def _moved(rig: Rig, steps: dict[str, FloatArray]) -> Rig:

@@ -167,6 +167,14 @@ class FinalBa:
         whole = FinalBa(history, summary, None, last.noise, fixes=last.fixes, within=own)
         return whole.with_calibration([found.checked for found in parts], rig, backend)
 
+    def about(self, nominal: Rig, backend: BackendConfig) -> FinalBa:
+        """With the calibration as it is found with a prior about another one than that of it."""
+        if self.calibration is None or self.checked is None:
+            return self
+        stamp_ns, rig = self.calibration.stamp_ns, self.calibration.nominal
+        found = self.checked.estimate(rig, backend.calibration, stamp_ns, nominal)
+        return replace(self, calibration=found)
+
     def with_calibration(
         self, parts: Sequence[CalibrationEquations | None], rig: Rig, backend: BackendConfig
     ) -> FinalBa:
@@ -180,11 +188,8 @@ class FinalBa:
         checked = CalibrationEquations.total([part for part in parts if part is not None])
         if checked is None:
             return self
-        try:
-            end_ns = int(self.trajectory.stamps_ns[-1])
-            found = checked.estimate(rig, backend.calibration, end_ns)
-        except np.linalg.LinAlgError:
-            return self
+        end_ns = int(self.trajectory.stamps_ns[-1])
+        found = checked.estimate(rig, backend.calibration, end_ns)
         return replace(self, checked=checked, calibration=found)
 
 

@@ -15,7 +15,7 @@ import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import B, V, X
 
-from slam_graph.arrays import BoolArray, FloatArray
+from slam_graph.arrays import BoolArray, FloatArray, IntArray
 from slam_graph.backend.cost.feature_tracks import Observations
 from slam_graph.backend.cost.reprojection import Geometry, RigProjection
 from slam_graph.backend.cost.robust_loss import RobustLoss
@@ -148,8 +148,8 @@ class LinearReprojection:
     weights: FloatArray
     normalized: FloatArray
 
-    def rows(self, keep: BoolArray) -> LinearReprojection:
-        """Some of the observations, of the same features."""
+    def rows(self, keep: BoolArray | IntArray) -> LinearReprojection:
+        """Some of the observations, by mask or number, of the same features."""
         parts = self.r, self.by_pose, self.by_point, self.weights, self.normalized
         return LinearReprojection(self.obs.rows(keep), *(part[keep] for part in parts))
 
