@@ -29,7 +29,14 @@ from slam_graph.backend.solve.state import (
     letter_and_index,
 )
 from slam_graph.geometry import NavState
-from slam_graph.sensors import CalibrationEstimate, FeatureFrame, ImuBuffer, Rig, RigCamera
+from slam_graph.sensors import (
+    CalibrationEstimate,
+    Camera,
+    FeatureFrame,
+    ImuBuffer,
+    Rig,
+    RigCamera,
+)
 
 MAX_EARLY_NS = 50_000_000
 """A frame may be taken this much too early where the IMU has no samples yet."""
@@ -124,15 +131,11 @@ class CalibrationVariables:
     def _sigmas(self, key: int) -> FloatArray:
         """Prior standard deviations (dim,) of a variable, in its tangent."""
         kind, c = letter_and_index(key)
-        config = self.config
-        if kind == "e":
-            return np.repeat([config.rotation_sigma_rad, config.position_sigma_m], 3)
-        if kind == "k":
-            focal = config.focal_length_sigma * self.nominal.cameras[c].camera.intrinsics[:2]
-            return np.append(focal, np.repeat(config.principal_point_sigma_px, 2))
-        if kind == "t":
-            return np.array([config.readout_sigma_s if c else config.time_offset_sigma_s])
-        return np.full(dim(key), config.distortion_sigma)
+        if kind == "t" and c:
+            return np.array([self.config.readout_sigma_s])
+        if kind in "ekt":
+            return prior_sigmas(kind, self.nominal.cameras[c].camera, self.config)
+        return np.full(dim(key), self.config.distortion_sigma)
 
     def moved_far(self, posterior: SquareRootInformation, delta: FloatArray) -> bool:
         """Whether a step (n,) moved the parameters far, compared to their standard deviations.
@@ -287,6 +290,23 @@ class CalibrationVariables:
         if self.rolling and frame in state.motions:
             lead_ns = round(state.motions[frame].time_offset_s * 1e9)
             self.note_motion(state, frame, stamp_ns, stamp_ns - lead_ns, imu)
+
+
+def prior_sigmas(letter: str, lens: Camera, config: CalibrationConfig) -> FloatArray:
+    """Prior standard deviations of a variable, in its tangent.
+
+    Args:
+        letter: `e` for a mounting (6,), rad and m; `k` for focal lengths and principal point (4,),
+            pixels; `t` for the time offset (1,), s.
+        lens: of the camera.
+        config: settings.
+    """
+    if letter == "e":
+        return np.repeat([config.rotation_sigma_rad, config.position_sigma_m], 3)
+    if letter == "k":
+        focal = config.focal_length_sigma * lens.intrinsics[:2]
+        return np.append(focal, np.repeat(config.principal_point_sigma_px, 2))
+    return np.array([config.time_offset_sigma_s])
 
 
 def rolling_motion(now: NavState, frame_ns: int, imu: ImuBuffer, rig: Rig) -> FrameMotion:

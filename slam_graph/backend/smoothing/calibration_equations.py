@@ -26,7 +26,7 @@ import numpy as np
 
 from slam_graph.arrays import FloatArray
 from slam_graph.backend.backend_config import CalibrationConfig
-from slam_graph.backend.online_calibration import rolling_motion
+from slam_graph.backend.online_calibration import prior_sigmas, rolling_motion
 from slam_graph.backend.smoothing.recording_cost import (
     EliminatedFeatures,
     LinearCost,
@@ -47,11 +47,10 @@ def variables_of(rig: Rig) -> dict[str, slice]:
 
     A lens that GTSAM does not have is left out: the adjustment has a pinhole in its place.
     """
-    columns: dict[str, slice] = {}
-    for name in [*_of_cameras(rig), "t0"]:
-        start = max((columns[known].stop for known in columns), default=0)
-        columns[name] = slice(start, start + _SIZES[name[0]])
-    return columns
+    names = [*_of_cameras(rig), "t0"]
+    stops = np.cumsum([_SIZES[name[0]] for name in names]).tolist()
+    starts = [0, *stops[:-1]]
+    return {name: slice(*ends) for name, *ends in zip(names, starts, stops, strict=True)}
 
 
 def _of_cameras(rig: Rig) -> Iterator[str]:
@@ -94,7 +93,9 @@ class CalibrationEquations:
             nominal: the calibration that the prior is about; `rig` if not said.
         """
         columns = variables_of(rig)
-        prior = np.concatenate([_sigmas(name, rig, config) for name in columns])
+        prior = np.concatenate(
+            [prior_sigmas(name[0], rig.cameras[int(name[1:])].camera, config) for name in columns]
+        )
         covariance = np.asarray(np.linalg.inv(self.information + np.diag(prior**-2.0)), np.float64)
         nominal = nominal or rig
         away = np.concatenate([_difference(name, rig, nominal) for name in columns])
@@ -177,16 +178,6 @@ class CalibrationColumns:
                 by_lens = mounted.camera.by_intrinsics(images.normalized[rows])
                 J[rows, :, columns[f"k{c}"]] = images.weights[rows, None, None] * by_lens
         return J
-
-
-def _sigmas(name: str, rig: Rig, config: CalibrationConfig) -> FloatArray:
-    """Prior standard deviations of a variable."""
-    if name == "t0":
-        return np.array([config.time_offset_sigma_s])
-    if name.startswith("e"):
-        return np.repeat([config.rotation_sigma_rad, config.position_sigma_m], 3)
-    focal = rig.cameras[int(name[1:])].camera.intrinsics[:2] * config.focal_length_sigma
-    return np.append(focal, np.repeat(config.principal_point_sigma_px, 2))
 
 
 def _difference(name: str, rig: Rig, nominal: Rig) -> FloatArray:

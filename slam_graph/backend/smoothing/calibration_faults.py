@@ -13,14 +13,15 @@ from slam_graph.arrays import FloatArray
 from slam_graph.sensors import CalibrationEstimate
 
 _SIGMAS = 6.0
-"""A difference counts from so many standard deviations on, and if it is larger than these, below
-which it hardly matters and calibrations are no better:"""
+"""A difference counts from so many standard deviations on."""
 _TURN_RAD, _MOVE_M = np.deg2rad(0.2), 0.015
 _FOCAL, _CENTRE_PX = 0.005, 3.0
 _OFFSET_S = 0.0015
+"""It must also be larger than these: smaller ones hardly matter, and no calibration is better. The
+focal length is relative."""
 _HARMFUL = 2.0
-"""So many times as much may harm: with a camera turned by 0.5° the error of V1_02 is three times as
-large, with 0.3° twice."""
+"""A difference of so many times these limits may harm: with a camera turned by 0.5° the error of
+V1_02 is three times as large, with 0.3° twice."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,9 +29,9 @@ class _Difference:
     """A difference of some parameters from what they are taken for.
 
     Attributes:
-        what: in words, with a place for the size and its standard deviation.
-        size: its length.
-        least: what counts.
+        what: in words.
+        size: its length, in rad, m, pixels, s, or relative.
+        least: the smallest size that counts.
         sigmas: its Mahalanobis distance.
     """
 
@@ -43,7 +44,15 @@ class _Difference:
     def of(
         cls, what: str, d: FloatArray, covariance: FloatArray, least: float, unit: float = 1.0
     ) -> _Difference:
-        """Of a vector (n,) with its covariance (n, n); `unit` is what it is shown in."""
+        """Of a vector (n,) with its covariance (n, n).
+
+        Args:
+            what: in words, with places for the size and its standard deviation.
+            d: the vector.
+            covariance: of it.
+            least: the smallest size that counts.
+            unit: what the size is shown in.
+        """
         size = float(np.linalg.norm(d))
         squared = float(np.dot(d, np.linalg.solve(covariance, d)))
         sigmas = max(squared, 0.0) ** 0.5
