@@ -51,6 +51,9 @@ _BETTER = 2.0
 """Another mounting or handedness must have a misfit smaller by this factor …"""
 _FITS, _NOTHING_FITS = 0.3, 0.5
 """… and below this to be taken; beyond this nothing fits."""
+_EXPLAINED = 0.2
+"""Something fits all the same if it leaves so small a part of the calibration's epipolar distances:
+rotations from two views are bad where the lens is wrong and the camera turns little."""
 FEWEST_PAIRS = 10
 CLEARLY = 1.05
 """The noise of one fit is clearly larger than that of another by this factor."""
@@ -89,7 +92,8 @@ def compare(rig: Rig, parts: list[Part]) -> CameraAndGyroscope:
     start = _coarse_mounting(now, turning)
     problem = RotationProblem(pairs, now.gyroscopes, camera)
     now.fit = _solved(problem, start)
-    if now.fit is None or turning.misfit > _NOTHING_FITS:
+    alike = turning.misfit <= _NOTHING_FITS
+    if now.fit is None or not (alike or _explains(now.fit, problem, _calibrated(camera))):
         now.fit = None
         what = "camera and gyroscope do not turn alike under any mounting"
         fix = "compare the clocks (more than 0.2 s?); mask moving objects; check the matches"
@@ -131,6 +135,11 @@ def _shows_faults(now: CameraAndGyroscope, fit: RotationFit) -> bool:
     tried = replace(now, findings=[])
     judge(tried, fit)
     return any(finding.severity != "info" for finding in tried.findings)
+
+
+def _explains(fit: RotationFit, problem: RotationProblem, start: Kinematics) -> bool:
+    """Whether next to nothing is left of what does not fit at the start."""
+    return fit.noise_px < _EXPLAINED * problem.noise_px(start)
 
 
 def _calibration_is_better(problem: RotationProblem, start: Kinematics, fit: RotationFit) -> bool:

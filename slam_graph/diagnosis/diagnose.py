@@ -11,7 +11,7 @@ from slam_graph.arrays import FloatArray
 from slam_graph.datasets import RecordedSequence
 from slam_graph.diagnosis.camera_and_gyroscope import compare, refine
 from slam_graph.diagnosis.clock_windows import ClockWindows
-from slam_graph.diagnosis.finding import Finding, in_order, no_surer
+from slam_graph.diagnosis.finding import CERTAIN_SIGMAS, Finding, in_order, no_surer
 from slam_graph.diagnosis.fit_findings import CameraAndGyroscope
 from slam_graph.diagnosis.frame_checks import check_images, check_stamps, check_tracks
 from slam_graph.diagnosis.gathering import (
@@ -52,6 +52,8 @@ SETUP_KINDS = (
 """Findings about what a run was given: calibration, units and clocks."""
 _SURE_WARNINGS = ("baseline", "stereo_geometry")
 """Those that count where they are warnings too; all others where they are errors."""
+_ENOUGH_MATCHES = 300
+"""Of images of two cameras, at two times at least: SIFT takes a quarter of a second an image."""
 _AFTER_CHANGE = SETUP_KINDS[SETUP_KINDS.index("time_offset_change") :]
 """Findings that are less plain than a change of the time offset."""
 
@@ -136,10 +138,7 @@ class Diagnosis:
                 nothing is compared across them, if enough is left.
         """
         material = _remembered(rig, frames, imu, lost)
-        for pair in pairs:
-            first, second = pair.images[:2]
-            if first is not None and second is not None:
-                material.stereo.append(match_images(pair.stamp_ns, first, second))
+        material.stereo += _matched(pairs)
         return Diagnosis(in_order(_judged(material)))
 
     @staticmethod
@@ -205,6 +204,26 @@ class Diagnosis:
     def certain_errors(self) -> list[Finding]:
         """Errors of calibration, units and clocks that are certain."""
         return [f for f in self.setup_faults if f.severity == "error" and f.sure == "certain"]
+
+    def rules_out(self, limits: Mapping[str, float]) -> bool:
+        """Whether nothing is wrong, and faults of this size would be certain.
+
+        Args:
+            limits: logarithms of the factors of ``focal_length`` and ``baseline``, and the turn of
+                the ``mounting``, degrees, as far as they are to be ruled out.
+        """
+        sigmas: dict[str, object] = {}
+        for finding in self.findings:
+            if finding.kind == "camera_and_gyroscope":
+                sigmas["focal_length"] = finding.values["focal_sigma"]
+                sigmas["mounting"] = finding.values["turn_sigma_deg"]
+            elif finding.kind == "scale":
+                sigmas["baseline"] = finding.values["sigma"]
+        known = (
+            isinstance(sigma := sigmas.get(kind), float) and CERTAIN_SIGMAS * sigma < limit
+            for kind, limit in limits.items()
+        )
+        return not self.faults and all(known)
 
     def best_guess(self) -> str:
         """The likeliest fault and what mends it, in one line; empty if none was found."""
@@ -274,6 +293,18 @@ def _by_cameras(
 
 def _faults(now: CameraAndGyroscope) -> int:
     return sum(finding.severity != "info" for finding in now.findings)
+
+
+def _matched(pairs: Sequence[CameraFrame]) -> list[StereoMatches]:
+    """Matches between images of two cameras, of the latest pair and as many others as it takes."""
+    found: list[StereoMatches] = []
+    for pair in reversed(pairs):
+        first, second = pair.images[:2]
+        if first is not None and second is not None:
+            found.append(match_images(pair.stamp_ns, first, second))
+        if len(found) > 1 and sum(len(matches.first) for matches in found) >= _ENOUGH_MATCHES:
+            break
+    return found
 
 
 def _remembered(

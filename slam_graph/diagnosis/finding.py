@@ -12,7 +12,7 @@ Severity = Literal["error", "warning", "info"]
 _SEVERITIES: tuple[Severity, ...] = ("error", "warning", "info")
 
 Sureness = Literal["certain", "likely", "hint"]
-_CERTAIN_SIGMAS, _LIKELY_SIGMAS = 10.0, 5.0
+CERTAIN_SIGMAS, _LIKELY_SIGMAS = 10.0, 5.0
 """From so many standard deviations on a finding is certain, or likely."""
 
 
@@ -64,7 +64,7 @@ def graded(bad: bool) -> Severity:
 
 def sureness(sigmas: float) -> Sureness:
     """How sure a difference of so many standard deviations is."""
-    if sigmas >= _CERTAIN_SIGMAS:
+    if sigmas >= CERTAIN_SIGMAS:
         return "certain"
     return "likely" if sigmas >= _LIKELY_SIGMAS else "hint"
 

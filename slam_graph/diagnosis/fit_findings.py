@@ -167,7 +167,9 @@ def _agreement(fit: RotationFit, change_s: float, sigma: dict[str, float]) -> Fi
     )
     if sigma["offset"] < _KNOWN_OFFSET_S and sigma["focal"] < _KNOWN_FOCAL:
         text = f"camera and gyroscope agree: {figures}"
-        return Finding("camera_and_gyroscope", "info", text)
+        turn = np.rad2deg(np.sqrt(np.linalg.eigvalsh(fit.covariance[3:6, 3:6])[-1]))
+        values = {"focal_sigma": sigma["focal"], "turn_sigma_deg": float(turn)}
+        return Finding("camera_and_gyroscope", "info", text, values=values)
     text = f"the camera turns too little to say whether it agrees with the gyroscope: {figures}"
     return Finding("turns_too_little", "info", text, "record livelier motion")
 

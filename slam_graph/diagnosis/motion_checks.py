@@ -83,7 +83,7 @@ def _windows(now: CameraAndGyroscope, fit: RotationFit, rig: Rig, length_s: floa
     """Windows that show something, the liveliest first."""
     found: list[Window] = []
     for part, gyroscope in zip(now.parts, now.gyroscopes, strict=True):
-        frames = _thinned([_seen(frame, rig) for frame in part.frames if frame.cameras])
+        frames = [_seen(f, rig) for f in _thinned([f for f in part.frames if f.cameras])]
         end_s = gyroscope.t[-1] - abs(fit.values.offset_s) - 0.05
         frames = [f for f in frames if gyroscope.seconds(np.array(f.stamp_ns)) < end_s]
         count = round(length_s / _SPACING_S)

@@ -6,7 +6,8 @@ A run with a wrong calibration may come to its end, with errors that nothing in 
 run is followed by a quick look at the tracks after its start, and one that failed, was not smooth,
 or contradicts that look, by a diagnosis. If that finds a fault in what the run was given, the run
 is `suspect`, whatever it has estimated. A run that does not start is looked at while it waits, and
-one that goes on 6, 12 and 24 s after its start. After 24 s all frames are there that are looked at.
+one that goes on 6 and 24 s after its start, and after 12 s where 6 s were too little to tell. After
+24 s all frames are there that are looked at.
 The time offset between camera and IMU is watched over the whole run, as it may change later on.
 """
 
@@ -35,7 +36,8 @@ if TYPE_CHECKING:
 _FIRST_LOOK_NS = 5_000_000_000
 """A run that has waited so long for a start is looked at, and again after twice that."""
 _EARLY_LOOKS_NS = (KEPT_NS // 4, KEPT_NS // 2)
-"""An estimate that goes on is looked at so long after its start, and again after `KEPT_NS`."""
+"""An estimate that goes on is looked at so long after its start, and again after `KEPT_NS`; one
+whose start had to be corrected is doubted, and looked at at once as well."""
 _HINDERING = {"gyroscope_scale": 0.1, "baseline": 0.3}
 """Logarithms of factors from which these keep a run from starting; smaller ones only harm it."""
 _RUINING = _HINDERING | {"focal_length": 0.2}
@@ -93,12 +95,13 @@ class Verdict(Stage):
         objects = objects or NoObjects()
         self._estimates_objects = type(objects) is not NoObjects
         rig = result.input.rig
-        self._kept = KeptFrames(len(rig.cameras) > 1, objects)
+        self._cameras = len(rig.cameras)
+        self._kept = KeptFrames(self._cameras > 1, objects)
         self._clocks = ClockWatch(result, objects, diagnostics) if rig.has_imu else None
         self._estimated = self._at_limit = 0  # frames with a state; noise of the IMU at its limit
         self._looked: Diagnosis | None = None  # a quick look at all that is kept
         self._look_failed = False
-        self._early_looks = 0  # how often the estimate was looked at since its start
+        self._early_looks_ns: tuple[int, ...] = _EARLY_LOOKS_NS  # those to come
         self._started_ns: int | None = None
         self._waits_since_ns: int | None = None
         self._look_ns = 0  # time of waiting after which the recording is looked at next
@@ -118,7 +121,8 @@ class Verdict(Stage):
             self._clocks.add(frame)
         if frame.restarted:
             self._estimated = self._at_limit = 0
-            self._looked, self._look_failed, self._early_looks = None, False, 0
+            self._looked, self._look_failed = None, False
+            self._early_looks_ns = (0,) * frame.initialized + _EARLY_LOOKS_NS
         self._estimated += frame.initialized
         self._at_limit += frame.initialized and frame.imu_noise_at_limit
         if frame.restarted or not frame.initialized:
@@ -226,13 +230,18 @@ class Verdict(Stage):
     def _watch_early(self, lasted_ns: int) -> None:
         """Look now and then whether the estimate is worth anything, before all frames are there.
 
+        A look that rules out what would ruin it is the last one of these.
+
         Raises:
             DataError: if what the run was given is certainly wrong, and by so much.
         """
-        looks = self._early_looks
-        if self._refuses and looks < len(_EARLY_LOOKS_NS) and lasted_ns > _EARLY_LOOKS_NS[looks]:
-            self._early_looks += 1
-            self._refuse_if_ruined(self._quick_look())
+        if not self._refuses or not self._early_looks_ns or lasted_ns <= self._early_looks_ns[0]:
+            return
+        look = self._quick_look()
+        self._refuse_if_ruined(look)
+        limits = {kind: _RUINING[kind] for kind in ("focal_length", "baseline")[: self._cameras]}
+        clear = look is not None and look.rules_out(limits | {"mounting": _RUINING_DEG})
+        self._early_looks_ns = () if clear else self._early_looks_ns[1:]
 
     def _watch_full(self) -> None:
         """Look once whether the estimate is worth anything, when all that is looked at is there.
