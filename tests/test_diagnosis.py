@@ -116,6 +116,22 @@ def test_sound_tracks_have_no_faults(real_tracks: Recorded, stereo_tracks: Recor
     assert any(finding.kind == "scale" for finding in diagnosis.findings)
 
 
+def test_a_quick_look_rules_out_what_it_would_have_seen(stereo_tracks: Recorded) -> None:
+    rig, frames, imu = stereo_tracks
+    wrong = changed(rig, lambda c: magnified(c, 1.1))
+    large = {"focal_length": 0.2, "baseline": 0.7, "mounting": 6.0}
+
+    def look(rig: Rig, seconds: float) -> Diagnosis:
+        end_ns = frames[0].stamp_ns + round(seconds * 1e9)
+        seen = [normalized_by(rig, frame) for frame in frames if frame.stamp_ns < end_ns]
+        return Diagnosis.nearby(rig, seen, imu)
+
+    assert look(rig, 14.0).rules_out(large)
+    assert not look(rig, 14.0).rules_out({"mounting": 0.01})  # it is not known so well
+    assert not look(wrong, 14.0).rules_out({"mounting": 6.0})  # something is wrong
+    assert not look(rig, 1.0).rules_out({"focal_length": 0.2})  # too short to be compared
+
+
 def test_an_unknown_mounting_is_found_and_no_fault(stereo_tracks: Recorded) -> None:
     rig = changed(
         stereo_tracks[0],

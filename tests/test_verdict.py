@@ -14,6 +14,7 @@ import pytest
 from groups import slow
 from typer.testing import CliRunner
 
+from benchmarks.wrong_setups import WronglySetUp, focal_length
 from slam_graph.cli.main import app
 from slam_graph.datasets import kalibr_text
 from slam_graph.datasets.dataset_registry import open_dataset
@@ -296,7 +297,7 @@ def test_a_wrong_setup_under_which_an_estimate_lasts_is_refused_after_some_secon
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Not at the end of a recording that may be long; by a later look if there is none before."""
-    looks = [look_ns for look_ns in verdict._EARLY_LOOKS_NS if look_ns >= after_s * 1e9]
+    looks = tuple(look_ns for look_ns in verdict._EARLY_LOOKS_NS if look_ns >= after_s * 1e9)
     monkeypatch.setattr(verdict, "_EARLY_LOOKS_NS", looks)
     path = data_dir / "euroc_inertial/V2_01_easy"
     sequence = simulate(
@@ -308,6 +309,19 @@ def test_a_wrong_setup_under_which_an_estimate_lasts_is_refused_after_some_secon
     assert named in result.message
     begun_s = (result.segments[0].begin_ns - result.input.start_ns) * 1e-9
     assert after_s - 1.0 < result.logs.frames / RATE_HZ - begun_s < after_s + 1.0
+
+
+@pytest.mark.slow
+@pytest.mark.data
+def test_a_start_that_is_corrected_under_a_wrong_lens_is_looked_at_at_once(data_dir: Path) -> None:
+    recording = open_dataset(data_dir / "euroc/MH_01_easy_17s")
+    longer = WronglySetUp(recording, focal_length(1.3))
+    result = run(longer, algorithm="okvis", overrides=CAUSAL)
+    assert result.status == "failed"
+    assert "the estimate is wrong: the calibrated focal length is" in result.message
+    assert result.warnings["start_corrected"] == 1
+    begun_s = (result.segments[0].begin_ns - result.input.start_ns) * 1e-9
+    assert result.logs.frames / 20.0 - begun_s < 1.0  # of the start that was solved again
 
 
 @pytest.mark.parametrize("at_s", [slow(2.5), 4.5])
