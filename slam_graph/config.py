@@ -79,8 +79,8 @@ class LimitsConfig(Settings):
     refuse_wrong_setup: bool = expert(default=True)
     """Whether a run is ended whose calibration or units are certainly wrong, as a diagnosis finds.
     One that waits for its first state, or for another one before a segment has lasted for five
-    seconds, is looked at after 5 s of the recording, again after 10, 20, … s, and at once after a
-    loss. One whose estimate has lasted is looked at 6 and 24 s after its start (after 12 s as well
+    seconds, is diagnosed after 5 s of the recording, again after 10, 20, … s, and at once after a
+    loss. One whose estimate has lasted is diagnosed 6 and 24 s after its start (after 12 s as well
     where 6 s were too little to tell), and while it waits after a loss, and is ended only if
     calibration or units are so wrong that the estimate is worth nothing. Without it, or without
     `backend.initialization.check_calibration`, the cause is looked for at the end."""

@@ -116,7 +116,7 @@ def test_sound_tracks_have_no_faults(real_tracks: Recorded, stereo_tracks: Recor
     assert any(finding.kind == "scale" for finding in diagnosis.findings)
 
 
-def test_a_quick_look_rules_out_what_it_would_have_seen(stereo_tracks: Recorded) -> None:
+def test_a_quick_diagnosis_rules_out_what_it_would_have_seen(stereo_tracks: Recorded) -> None:
     rig, frames, imu = stereo_tracks
     wrong = changed(rig, lambda c: magnified(c, 1.1))
     large = {"focal_length": 0.2, "baseline": 0.7, "mounting": 6.0}

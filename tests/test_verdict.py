@@ -172,7 +172,7 @@ def test_a_failure_of_the_clock_watch_costs_no_diagnosis(monkeypatch: pytest.Mon
 
 
 @pytest.mark.parametrize("wrong", [slow(lambda rig: rig), slow(with_longer_lenses), turned])
-def test_a_quick_look_says_what_the_whole_diagnosis_says(wrong: Callable[[Rig], Rig]) -> None:
+def test_a_quick_diagnosis_says_what_the_whole_diagnosis_says(wrong: Callable[[Rig], Rig]) -> None:
     """Where the calibration is right or nearly so; there is nothing else that it is for."""
     recording = flown(wrong)
     frames = [f for f in recording.frames() if isinstance(f, FeatureFrame)]
@@ -297,8 +297,8 @@ def test_a_wrong_setup_under_which_an_estimate_lasts_is_refused_after_some_secon
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Not at the end of a recording that may be long; by a later look if there is none before."""
-    looks = tuple(look_ns for look_ns in verdict._EARLY_LOOKS_NS if look_ns >= after_s * 1e9)
-    monkeypatch.setattr(verdict, "_EARLY_LOOKS_NS", looks)
+    looks = tuple(look_ns for look_ns in verdict._EARLY_CHECKS_NS if look_ns >= after_s * 1e9)
+    monkeypatch.setattr(verdict, "_EARLY_CHECKS_NS", looks)
     path = data_dir / "euroc_inertial/V2_01_easy"
     sequence = simulate(
         trajectory=str(path), real_imu=True, cameras=1, duration_s=40.0, rate_hz=RATE_HZ, seed=0
@@ -313,7 +313,7 @@ def test_a_wrong_setup_under_which_an_estimate_lasts_is_refused_after_some_secon
 
 @pytest.mark.slow
 @pytest.mark.data
-def test_a_start_that_is_corrected_under_a_wrong_lens_is_looked_at_at_once(data_dir: Path) -> None:
+def test_a_start_that_is_corrected_under_a_wrong_lens_is_diagnosed_at_once(data_dir: Path) -> None:
     recording = open_dataset(data_dir / "euroc/MH_01_easy_17s")
     longer = WronglySetUp(recording, focal_length(1.3))
     result = run(longer, algorithm="okvis", overrides=CAUSAL)

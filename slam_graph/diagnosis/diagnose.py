@@ -72,7 +72,7 @@ class Diagnosis:
 
     @staticmethod
     def of(recording: RecordedSequence) -> Diagnosis:
-        """Look at all that can be judged without an estimate of the trajectory.
+        """Judge all that can be judged without an estimate of the trajectory.
 
         The IMU is read as a whole, images or tracks in up to three parts of 8 s, those in which
         the platform turns most.
@@ -148,7 +148,7 @@ class Diagnosis:
         imu: ImuData,
         lost: Sequence[tuple[int, int]] = (),
     ) -> Diagnosis:
-        """A quick look, in a tenth of the time, where the calibration is right or nearly so.
+        """A quick diagnosis, in a tenth of the time, where the calibration is right or nearly so.
 
         Units and axes of gyroscope and accelerometer are those with which an estimate came to its
         end, so that nothing else is tried. Arguments are those of `of_tracks`.

@@ -29,6 +29,8 @@ _READOUT_S = 8e-3
 _SCALE, _BAD_SCALE = 0.02, 0.05
 _KNOWN_OFFSET_S, _KNOWN_FOCAL = 1e-2, 0.05
 """Camera and gyroscope agree only if clocks and focal length are known so well."""
+_KNOWN_TURN_RAD = np.deg2rad(5.0)
+"""An unknown mounting counts as found if it is known so well."""
 _LIKE_PRINCIPAL_POINT_RAD = np.deg2rad(5.0)
 _LIKE_PRINCIPAL_POINT, _BAD_FIT_PX = 0.1, 1.5
 """A wrong principal point looks like a turn of the camera that is smaller than this, and like such
@@ -179,8 +181,10 @@ def _judge_mounting(now: CameraAndGyroscope, fit: RotationFit) -> None:
     R = now.rig.cameras[0].body_T_camera.rotation().matrix()
     turn, covariance = fit.turn_from(R)
     if not now.rig.cameras[0].rotation_known:
-        now.findings.append(_found_mounting(fit.values.body_R_camera, covariance))
-        now.rig = _turned(now.rig, fit.values.body_R_camera @ R.T)
+        sigma = float(np.sqrt(np.linalg.eigvalsh(covariance)[-1]))
+        now.findings.append(_found_mounting(fit.values.body_R_camera, sigma))
+        if sigma < _KNOWN_TURN_RAD:
+            now.rig = _turned(now.rig, fit.values.body_R_camera @ R.T)
         return
     away = float(np.linalg.norm(turn))
     sigmas = float(np.sqrt(turn @ np.linalg.solve(covariance, turn)))
@@ -211,10 +215,15 @@ def _inverted(rig: Rig) -> Rig:
     return replace(rig, cameras=tuple(cameras))
 
 
-def _found_mounting(R: FloatArray, covariance: FloatArray) -> Finding:
-    """The mounting that was found where it is unknown, which is no fault."""
-    sigma = np.rad2deg(np.sqrt(np.linalg.eigvalsh(covariance)[-1]))
-    what = f"the mounting of the camera, which is unknown, is found to {sigma:.1f}°"
+def _found_mounting(R: FloatArray, sigma: float) -> Finding:
+    """The mounting R (3, 3) that was found where it is unknown, to sigma (rad); it is no fault."""
+    degrees = np.rad2deg(sigma)
+    if sigma >= _KNOWN_TURN_RAD:
+        text = (
+            f"the camera turns too little to find its mounting, which is unknown: ± {degrees:.0f}°"
+        )
+        return Finding("turns_too_little", "info", text, "record livelier motion")
+    what = f"the mounting of the camera, which is unknown, is found to {degrees:.1f}°"
     fix = f"in the place of T_cam_imu: unknown, a T_cam_imu with the rotation {_rows(R)}"
     return Finding("mounting", "info", what, fix, values={"body_R_camera": R.tolist()})
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""What the verdict on a run looks at: frames around its start, without features that move."""
+"""What the verdict on a run is judged by: frames around its start, without features that move."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from slam_graph.pipeline.stage import EstimatedFrame, NoObjects
 from slam_graph.sensors import CameraFrame, FeatureFrame, ImuData
 
 KEPT_NS = 24_000_000_000
-"""So much of the recording is looked at: what came after the start, as far as it goes."""
+"""So much of the recording is diagnosed: what came after the start, as far as it goes."""
 _PAIRS, _PAIRS_APART_NS = 4, 1_500_000_000
 """Images of two cameras that are kept, and the time between them."""
 _LEAST_LEFT = 0.6

@@ -3,11 +3,11 @@
 """The verdict on a run: what its recording says about calibration, units and clocks.
 
 A run with a wrong calibration may come to its end, with errors that nothing in it shows. So every
-run is followed by a quick look at the tracks after its start, and one that failed, was not smooth,
-or contradicts that look, by a diagnosis. If that finds a fault in what the run was given, the run
-is `suspect`, whatever it has estimated. A run that does not start is looked at while it waits, and
+run is followed by a quick diagnosis of the tracks after its start, and one that failed, was not
+smooth, or contradicts that, by a full one. If that finds a fault in what the run was given, the run
+is `suspect`, whatever it has estimated. A run that does not start is diagnosed while it waits, and
 one that goes on 6 and 24 s after its start, and after 12 s where 6 s were too little to tell. After
-24 s all frames are there that are looked at.
+24 s all frames are there that a diagnosis takes.
 The time offset between camera and IMU is watched over the whole run, as it may change later on.
 """
 
@@ -33,11 +33,11 @@ if TYPE_CHECKING:
     from slam_graph.backend import FinalBa
     from slam_graph.diagnosis import Diagnosis
 
-_FIRST_LOOK_NS = 5_000_000_000
-"""A run that has waited so long for a start is looked at, and again after twice that."""
-_EARLY_LOOKS_NS = (KEPT_NS // 4, KEPT_NS // 2)
-"""An estimate that goes on is looked at so long after its start, and again after `KEPT_NS`; one
-whose start had to be corrected is doubted, and looked at at once as well."""
+_FIRST_CHECK_NS = 5_000_000_000
+"""A run that has waited so long for a start is diagnosed, and again after twice that."""
+_EARLY_CHECKS_NS = (KEPT_NS // 4, KEPT_NS // 2)
+"""An estimate that goes on is diagnosed so long after its start, and again after `KEPT_NS`; one
+whose start had to be corrected is doubted, and diagnosed at once as well."""
 _HINDERING = {"gyroscope_scale": 0.1, "baseline": 0.3}
 """Logarithms of factors from which these keep a run from starting; smaller ones only harm it."""
 _RUINING = _HINDERING | {"focal_length": 0.2}
@@ -99,12 +99,12 @@ class Verdict(Stage):
         self._kept = KeptFrames(self._cameras > 1, objects)
         self._clocks = ClockWatch(result, objects, diagnostics) if rig.has_imu else None
         self._estimated = self._at_limit = 0  # frames with a state; noise of the IMU at its limit
-        self._looked: Diagnosis | None = None  # a quick look at all that is kept
-        self._look_failed = False
-        self._early_looks_ns: tuple[int, ...] = _EARLY_LOOKS_NS  # those to come
+        self._diagnosis: Diagnosis | None = None  # a quick one of all that is kept
+        self._diagnosis_failed = False
+        self._early_checks_ns: tuple[int, ...] = _EARLY_CHECKS_NS  # those to come
         self._started_ns: int | None = None
         self._waits_since_ns: int | None = None
-        self._look_ns = 0  # time of waiting after which the recording is looked at next
+        self._check_ns = 0  # time of waiting after which the recording is diagnosed next
         config = result.config
         self._refuses = config.limits.refuse_wrong_setup
         self._refuses &= config.backend.initialization.check_calibration
@@ -121,8 +121,8 @@ class Verdict(Stage):
             self._clocks.add(frame)
         if frame.restarted:
             self._estimated = self._at_limit = 0
-            self._looked, self._look_failed = None, False
-            self._early_looks_ns = (0,) * frame.initialized + _EARLY_LOOKS_NS
+            self._diagnosis, self._diagnosis_failed = None, False
+            self._early_checks_ns = (0,) * frame.initialized + _EARLY_CHECKS_NS
         self._estimated += frame.initialized
         self._at_limit += frame.initialized and frame.imu_noise_at_limit
         if frame.restarted or not frame.initialized:
@@ -206,7 +206,7 @@ class Verdict(Stage):
         ][:2]
 
     def _watch_start(self, stamp_ns: int, rig: Rig) -> None:
-        """Look now and then what keeps a run from starting; after a loss at once as well.
+        """Ask now and then what keeps a run from starting; after a loss at once as well.
 
         Raises:
             DataError: if what the run was given is certainly wrong.
@@ -216,55 +216,55 @@ class Verdict(Stage):
             losses = self._losses
             # what the loss was is left out only where it is known when it began
             known = lost and not self._result.segments.lasted
-            known = known and bool(losses) and stamp_ns - losses[-1][1] < _FIRST_LOOK_NS
-            self._waits_since_ns, self._look_ns = stamp_ns, 0 if known else _FIRST_LOOK_NS
+            known = known and bool(losses) and stamp_ns - losses[-1][1] < _FIRST_CHECK_NS
+            self._waits_since_ns, self._check_ns = stamp_ns, 0 if known else _FIRST_CHECK_NS
         waited_ns = stamp_ns - self._waits_since_ns
-        if waited_ns < self._look_ns:
+        if waited_ns < self._check_ns:
             return
-        self._look_ns = max(2 * self._look_ns, _FIRST_LOOK_NS)
+        self._check_ns = max(2 * self._check_ns, _FIRST_CHECK_NS)
         waited = f"no start in {waited_ns * 1e-9:.1f} s"
         if lost:
             waited = f"the estimate was lost{', ' + waited if waited_ns else ''}"
         self._refuse(waited, rig, _ruins if self._result.segments.lasted else _hinders)
 
     def _watch_early(self, lasted_ns: int) -> None:
-        """Look now and then whether the estimate is worth anything, before all frames are there.
+        """Ask now and then whether the estimate is worth anything, before all frames are there.
 
-        A look that rules out what would ruin it is the last one of these.
+        A diagnosis that rules out what would ruin it is the last one of these.
 
         Raises:
             DataError: if what the run was given is certainly wrong, and by so much.
         """
-        if not self._refuses or not self._early_looks_ns or lasted_ns <= self._early_looks_ns[0]:
+        if not self._refuses or not self._early_checks_ns or lasted_ns <= self._early_checks_ns[0]:
             return
-        look = self._quick_look()
-        self._refuse_if_ruined(look)
+        found = self._quick_diagnosis()
+        self._refuse_if_ruined(found)
         limits = {kind: _RUINING[kind] for kind in ("focal_length", "baseline")[: self._cameras]}
-        clear = look is not None and look.rules_out(limits | {"mounting": _RUINING_DEG})
-        self._early_looks_ns = () if clear else self._early_looks_ns[1:]
+        clear = found is not None and found.rules_out(limits | {"mounting": _RUINING_DEG})
+        self._early_checks_ns = () if clear else self._early_checks_ns[1:]
 
     def _watch_full(self) -> None:
-        """Look once whether the estimate is worth anything, when all that is looked at is there.
+        """Ask whether the estimate is worth anything, once when all frames for a diagnosis are there.
 
         Raises:
             DataError: if what the run was given is certainly wrong, and by so much.
         """
-        if self._looked is not None or self._look_failed:
+        if self._diagnosis is not None or self._diagnosis_failed:
             return
-        self._looked = self._quick_look()
-        self._look_failed = self._looked is None
+        self._diagnosis = self._quick_diagnosis()
+        self._diagnosis_failed = self._diagnosis is None
         if self._refuses:
-            self._refuse_if_ruined(self._looked)
+            self._refuse_if_ruined(self._diagnosis)
 
-    def _quick_look(self) -> Diagnosis | None:
-        """A quick look at what was recorded so far; None if it failed."""
+    def _quick_diagnosis(self) -> Diagnosis | None:
+        """A quick diagnosis of what was recorded so far; None if it failed."""
         with warn_on_failure(self._diagnostics, "diagnosis_failed", "the cause is not looked for"):
             return self._nearby(self._result.estimated_rig)
         return None
 
-    def _refuse_if_ruined(self, look: Diagnosis | None) -> None:
-        """Raise DataError if a quick look shows a fault that makes the estimate worth nothing."""
-        if look is not None and look.setup_faults:
+    def _refuse_if_ruined(self, found: Diagnosis | None) -> None:
+        """Raise DataError if a quick diagnosis shows a fault that makes the estimate worthless."""
+        if found is not None and found.setup_faults:
             self._refuse("the estimate is wrong", self._result.estimated_rig, _ruins)
 
     def _refuse(self, why: str, rig: Rig, matters: _Matters) -> None:
@@ -344,8 +344,8 @@ class Verdict(Stage):
 
         Args:
             rig: the calibration.
-            across_losses: whether losses of the estimate are looked at where too little else is
-                left.
+            across_losses: whether times in which the estimate was lost are taken where too little
+                else is left.
         """
         kept, losses = self._kept, self._result.segments.losses
         frames, imu = kept.frames, kept.imu
@@ -378,12 +378,12 @@ class Verdict(Stage):
         if kept.pairs and kept.shared < _FEWEST_SHARED:
             return True
         changed = self._estimates_objects or self._result.logs.calibration.latest is not None
-        if self._looked is None or changed:  # more is known now of calibration or of what moves
-            self._looked = self._nearby(self._result.estimated_rig)
-        return bool(self._looked.setup_faults)
+        if self._diagnosis is None or changed:  # more is known now of calibration or of what moves
+            self._diagnosis = self._nearby(self._result.estimated_rig)
+        return bool(self._diagnosis.setup_faults)
 
     def _nearby(self, rig: Rig) -> Diagnosis:
-        """A quick look at what was recorded."""
+        """A quick diagnosis of what was recorded."""
         from slam_graph.diagnosis import Diagnosis  # it takes a moment to import
 
         kept = self._kept

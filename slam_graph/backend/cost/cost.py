@@ -131,7 +131,7 @@ class Cost:
     sigma_px: FloatArray | None = None
     defines_unit: ClassVar[bool] = False  # whether its factors say what the unit of length is
     _layout: tuple[tuple[object, ...], Layout] | None = field(default=None, init=False)  # the last
-    _jacobians: dict[int, gtsam.JacobianFactor] = field(default_factory=dict)  # by id of the factor
+    _jacobians: dict[int, gtsam.JacobianFactor] = field(default_factory=dict, init=False)  # by id
     _squares: tuple[tuple[object, ...], FloatArray] = field(default=((), np.zeros(0)), init=False)
 
     @property
