@@ -11,6 +11,7 @@ import gtsam
 import numpy as np
 import pytest
 
+from benchmarks.wrong_setups import WronglySetUp, baseline
 from slam_graph import run
 from slam_graph.backend import FinalBa
 from slam_graph.datasets import RecordedSequence, dataset_from_arrays
@@ -114,6 +115,30 @@ def test_a_wrong_one_is_named_and_corrected(change: str, said: str) -> None:
     assert said in result.message
     assert "try --set backend.calibration." in result.message
     assert result.warnings["calibration_off"] == 1
+
+
+def test_a_wrong_baseline_is_named_and_corrected() -> None:
+    """A few millimetres of a camera's place, which its distance from the other one shows."""
+    sequence = simulate(trajectory="random", cameras=2, duration_s=14.0, rate_hz=10.0, seed=3)
+    truth = sequence.groundtruth()
+    result = run(WronglySetUp(sequence, baseline(1.05)))
+    found = result.final_ba
+    assert found is not None
+    assert truth is not None
+    assert "the calibrated baseline of cam1 is" in found.calibration_faults[0].what
+    assert "too long" in found.calibration_faults[0].what
+    assert found.calibration is not None
+    lengths = []
+    for rig in (sequence.rig, found.calibration.rig):
+        one, two = (mounted.body_T_camera.translation() for mounted in rig.cameras)
+        lengths.append(float(np.linalg.norm(two - one)))
+    assert lengths[1] == pytest.approx(lengths[0], rel=0.015)
+    causal, smoothed = (
+        ape(truth, path, alignment="yaw").statistics.rmse
+        for path in (result.trajectory, found.trajectory)
+    )
+    assert smoothed < 0.4 * causal
+    assert result.status == "suspect"
 
 
 def test_a_small_offset_that_is_found_late_loses_nothing() -> None:

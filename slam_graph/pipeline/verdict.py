@@ -244,7 +244,7 @@ class Verdict(Stage):
         self._early_checks_ns = () if clear else self._early_checks_ns[1:]
 
     def _watch_full(self) -> None:
-        """Ask whether the estimate is worth anything, once when all frames for a diagnosis are there.
+        """Ask whether the estimate is worth anything, once all frames for a diagnosis are there.
 
         Raises:
             DataError: if what the run was given is certainly wrong, and by so much.

@@ -7,7 +7,7 @@ The body frame is the IMU frame. `CalibrationEstimate` is the result of online c
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
@@ -272,12 +272,16 @@ class CalibrationEstimate:
             its tangent (rad and m, camera frame); `k0` (4, 4) of its intrinsics in pixels; `d0`
             (n, n) of the n coefficients of its camera model; `t0` (1, 1) of the time offset and
             `t1` of the readout time in seconds.
+        baseline_sigmas_m: standard deviations of the distances from the first camera to each of the
+            others, which are known better than the places of all cameras in the body; () if they
+            were not asked for.
     """
 
     stamp_ns: int
     nominal: Rig
     rig: Rig
     covariances: Mapping[str, FloatArray]
+    baseline_sigmas_m: Sequence[float] = ()
 
     def parameters(self) -> list[Parameter]:
         """All parameters that were estimated.

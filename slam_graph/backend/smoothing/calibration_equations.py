@@ -102,7 +102,9 @@ class CalibrationEquations:
         step = covariance @ (self.gradient + prior**-2.0 * away)
         moved = _moved(rig, {name: step[own] for name, own in columns.items()})
         blocks = {name: covariance[own, own] for name, own in columns.items()}
-        return CalibrationEstimate(stamp_ns, nominal, moved, blocks)
+        by_baselines = _baseline_rows(moved)
+        variances = np.einsum("ci,ij,cj->c", by_baselines, covariance, by_baselines)
+        return CalibrationEstimate(stamp_ns, nominal, moved, blocks, np.sqrt(variances).tolist())
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -178,6 +180,18 @@ class CalibrationColumns:
                 by_lens = mounted.camera.by_intrinsics(images.normalized[rows])
                 J[rows, :, columns[f"k{c}"]] = images.weights[rows, None, None] * by_lens
         return J
+
+
+def _baseline_rows(rig: Rig) -> FloatArray:
+    """Derivatives (C - 1, n) of the distances from the first camera to each of the others."""
+    columns, (first, *others) = variables_of(rig), [c.body_T_camera for c in rig.cameras]
+    rows = np.zeros((len(others), columns["t0"].stop))
+    for c, other in enumerate(others, 1):
+        away = other.translation() - first.translation()
+        away /= max(float(np.linalg.norm(away)), np.finfo(np.float64).tiny)
+        rows[c - 1, columns[f"e{c}"]][3:] = other.rotation().unrotate(away)
+        rows[c - 1, columns["e0"]][3:] = -first.rotation().unrotate(away)
+    return rows
 
 
 def _difference(name: str, rig: Rig, nominal: Rig) -> FloatArray:

@@ -5,20 +5,21 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from slam_graph.arrays import FloatArray
 from slam_graph.sensors import CalibrationEstimate
 
-_SIGMAS = 6.0
-"""A difference counts from so many standard deviations on."""
+_SIGMAS, _SIGMAS_BASELINE = 6.0, 4.5
+"""A difference counts from so many standard deviations on. That of a baseline is a single number,
+which no error of the world or the body is mixed with."""
 _TURN_RAD, _MOVE_M = np.deg2rad(0.2), 0.015
 _FOCAL, _CENTRE_PX = 0.005, 3.0
-_OFFSET_S = 0.0015
-"""It must also be larger than these: smaller ones hardly matter, and no calibration is better. The
-focal length is relative."""
+_OFFSET_S, _BASELINE = 0.0015, 0.007
+"""It must also be larger than these: smaller ones hardly matter, and no calibration is better.
+Focal lengths and baselines are relative."""
 _HARMFUL = 2.0
 """A difference of so many times these limits may harm: with a camera turned by 0.5° the error of
 V1_02 is three times as large, with 0.3° twice."""
@@ -33,12 +34,14 @@ class _Difference:
         size: its length, in rad, m, pixels, s, or relative.
         least: the smallest size that counts.
         sigmas: its Mahalanobis distance.
+        fewest: the smallest such distance that counts.
     """
 
     what: str
     size: float
     least: float
     sigmas: float
+    fewest: float = _SIGMAS
 
     @classmethod
     def of(
@@ -88,12 +91,26 @@ _SETTINGS = {
 def calibration_faults(found: CalibrationEstimate) -> list[CalibrationFault]:
     """What is off, the clearest first; [] where the calibration fits."""
     known = [(name, d) for name in found.covariances for d in _differences(found, name)]
-    off = [(name, d) for name, d in known if d.sigmas > _SIGMAS and d.size > d.least]
+    off = [(name, d) for name, d in known if d.sigmas > d.fewest and d.size > d.least]
     off.sort(key=lambda fault: fault[1].size / fault[1].least, reverse=True)
     return [
         CalibrationFault(d.what, name, _SETTINGS[name[0]], d.size > _HARMFUL * d.least)
         for name, d in off
     ]
+
+
+def _baseline(found: CalibrationEstimate, number: int) -> _Difference:
+    """How far a camera is from the first one, relative to what is calibrated."""
+    lengths = []
+    for rig in (found.nominal, found.rig):
+        first, other = (rig.cameras[c].body_T_camera.translation() for c in (0, number))
+        lengths.append(float(np.linalg.norm(other - first)))
+    was, now = lengths
+    wrong = "short" if now > was else "long"
+    what = f"the calibrated baseline of cam{number} is {{:.1f}} ± {{:.1f}} % too {wrong}"
+    variance = np.array([[(found.baseline_sigmas_m[number - 1] / was) ** 2]])
+    off = _Difference.of(what, np.array([now / was - 1.0]), variance, _BASELINE, 1e-2)
+    return replace(off, fewest=_SIGMAS_BASELINE)
 
 
 def _differences(found: CalibrationEstimate, name: str) -> Iterator[_Difference]:
@@ -110,6 +127,8 @@ def _differences(found: CalibrationEstimate, name: str) -> Iterator[_Difference]
         yield _Difference.of(what, step[:3], covariance[:3, :3], _TURN_RAD, np.deg2rad(1.0))
         what = f"cam{number} is {{:.0f}} ± {{:.0f}} mm away from where it is calibrated"
         yield _Difference.of(what, step[3:], covariance[3:, 3:], _MOVE_M, 1e-3)
+        if number and found.baseline_sigmas_m:
+            yield _baseline(found, number)
     else:
         focal, change = old.camera.intrinsics[:2], new.camera.intrinsics - old.camera.intrinsics
         what = f"the focal lengths of cam{number} are {{:.1f}} ± {{:.1f}} % off"
