@@ -134,7 +134,8 @@ def _overview(metrics: _Table) -> Iterator[tuple[str, str]]:
     if metrics["final_ba"]:
         yield "final BA", _final_ba(metrics["final_ba"])
         if metrics["final_ba"]["calibration_faults"]:
-            yield "calibration", "; ".join(metrics["final_ba"]["calibration_faults"])
+            off = "; ".join(metrics["final_ba"]["calibration_faults"])
+            yield "calibration", f"{off}; calibration_adjusted.yaml fits better (--calibration)"
     if metrics["loop_closure"]:
         table = metrics["loop_closure"]
         found = f"{table['accepted']} accepted of {table['verified']} verified"
