@@ -133,9 +133,7 @@ class CalibrationVariables:
         kind, c = letter_and_index(key)
         if kind == "t" and c:
             return np.array([self.config.readout_sigma_s])
-        if kind in "ekt":
-            return prior_sigmas(kind, self.nominal.cameras[c].camera, self.config)
-        return np.full(dim(key), self.config.distortion_sigma)
+        return prior_sigmas(kind, self.nominal.cameras[c].camera, self.config)
 
     def moved_far(self, posterior: SquareRootInformation, delta: FloatArray) -> bool:
         """Whether a step (n,) moved the parameters far, compared to their standard deviations.
@@ -297,7 +295,7 @@ def prior_sigmas(letter: str, lens: Camera, config: CalibrationConfig) -> FloatA
 
     Args:
         letter: `e` for a mounting (6,), rad and m; `k` for focal lengths and principal point (4,),
-            pixels; `t` for the time offset (1,), s.
+            pixels; `d` for the n coefficients of the distortion; `t` for the time offset (1,), s.
         lens: of the camera.
         config: settings.
     """
@@ -306,6 +304,8 @@ def prior_sigmas(letter: str, lens: Camera, config: CalibrationConfig) -> FloatA
     if letter == "k":
         focal = config.focal_length_sigma * lens.intrinsics[:2]
         return np.append(focal, np.repeat(config.principal_point_sigma_px, 2))
+    if letter == "d":
+        return np.full(len(lens.coefficients), config.distortion_sigma)
     return np.array([config.time_offset_sigma_s])
 
 

@@ -142,25 +142,44 @@ class Smoothing(Stage):
         """
         found, settings = first, self._result.config
         assert first.calibration is not None
-        nominal = rig = first.calibration.nominal
+        nominal = first.calibration.nominal
+        off = {fault.variable for fault in first.calibration_faults}
+        fitting = self._corrected(first, nominal, off)
         others = settings.objects, settings.loop_closure, settings.map
         for _ in range(0 if any(other.enabled for other in others) else _CALIBRATIONS):
-            step = replace(found.calibration, nominal=rig) if found.calibration else None
-            if step is None or not replace(found, calibration=step).calibration_faults:
-                break
-            rig, again = step.rig, None
+            rig, again = fitting, None
             with warn_on_failure(self._diagnostics, "calibration_off", _UNCALIBRATED):
                 again = self._adjusted(log, rig, consistent)
             if again is None or again.calibration is None:
                 break
+            more = {fault.variable for fault in again.calibration_faults}
+            off |= more
+            fitting = self._corrected(again, nominal, off)
             found = _with_all_steps(again.about(nominal, settings.backend), found)
+            if not more:
+                break
+        found = replace(found, fitting=fitting)
         latest = self._result.logs.calibration.latest
         estimated = () if latest is None else latest.covariances  # which the run has found itself
-        off = "; ".join(f.what for f in found.calibration_faults if f.variable not in estimated)
-        if off:
+        what = "; ".join(f.what for f in found.calibration_faults if f.variable not in estimated)
+        if what:
             corrected = "; the smoothed trajectory has it corrected" if found is not first else ""
-            self._diagnostics.warn("calibration_off", off + corrected)
+            self._diagnostics.warn("calibration_off", what + corrected)
         return found
+
+    def _corrected(self, found: backend.FinalBa, nominal: Rig, off: set[str]) -> Rig:
+        """The calibration of an adjustment, after a step of what is off; all else is right then.
+
+        Args:
+            found: the adjustment.
+            nominal: the calibration of the run, that the prior is about.
+            off: variables, as in `CalibrationEstimate`.
+        """
+        assert found.checked is not None
+        assert found.calibration is not None
+        config, rig = self._result.config.backend.calibration, found.calibration.nominal
+        stamp_ns = found.calibration.stamp_ns
+        return found.checked.estimate(rig, config, stamp_ns, nominal, off).rig
 
     def _adjusted(
         self, log: backend.FrameLog, rig: Rig | None = None, consistent: bool = False

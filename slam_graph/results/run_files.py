@@ -59,9 +59,8 @@ def _save_estimate(result: RunResult, files: ResultFolder) -> None:
     save_frames(result, files)
     files.text(names.CONFIG, [result.config.as_yaml()])
     save_rigs(result, files)
-    adjusted = result.final_ba
-    if adjusted is not None and adjusted.calibration is not None and adjusted.calibration_faults:
-        files.text(names.ADJUSTED_RIG, [kalibr_text(adjusted.calibration.rig)])
+    if result.final_ba is not None and result.final_ba.fitting is not None:
+        files.text(names.ADJUSTED_RIG, [kalibr_text(result.final_ba.fitting)])
     if result.logs.calibration.latest is not None:
         files.text("calibration.csv", result.logs.calibration.csv_lines())
     for stamp_ns, graph in result.graphs.items():

@@ -9,16 +9,16 @@ Gauss-Newton step from the minimum under the calibration as it is would move the
 
 with their prior P and the covariance (S + P)⁻¹. The factor of H_xx is there already, so that this
 costs little. The parameters are those of online calibration: where each camera is mounted, its
-focal lengths and principal point, and the time offset of all cameras. A camera that moves on the
-body by ξ in its own frame sees what it would see if the body moved by Ad_E ξ, E = body_T_camera;
-one that is late by τ, what it would see if the body had moved on by (ω, v) τ, its angular rate and
-velocity in its own frame. Of a rolling shutter the motion to the row of a feature is left out of
-the Jacobians.
+focal lengths, principal point and distortion, and the time offset of all cameras. A camera that
+moves on the body by ξ in its own frame sees what it would see if the body moved by Ad_E ξ, with
+E = body_T_camera; one that is late by τ, what it would see if the body had moved on by (ω, v) τ,
+its angular rate and velocity in its own frame. Of a rolling shutter the motion to the row of a
+feature is left out of the Jacobians.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Container, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import gtsam
@@ -36,8 +36,6 @@ from slam_graph.backend.smoothing.state_elimination import STATE, EliminatedStat
 from slam_graph.geometry import NavState
 from slam_graph.sensors import CalibrationEstimate, ImuBuffer, Rig, RigCamera
 
-_SIZES = {"e": 6, "k": 4, "t": 1}
-"""Components of a mounting (rotation, translation), of a lens (fx, fy, cx, cy), of the offset."""
 _BLOCK = 20_000
 """Observations at a time: their Jacobians would take 60 MB for two minutes with two cameras."""
 
@@ -47,17 +45,20 @@ def variables_of(rig: Rig) -> dict[str, slice]:
 
     A lens that GTSAM does not have is left out: the adjustment has a pinhole in its place.
     """
-    names = [*_of_cameras(rig), "t0"]
-    stops = np.cumsum([_SIZES[name[0]] for name in names]).tolist()
+    sizes = {**dict(_sizes_of_cameras(rig)), "t0": 1}
+    stops = np.cumsum(list(sizes.values())).tolist()
     starts = [0, *stops[:-1]]
-    return {name: slice(*ends) for name, *ends in zip(names, starts, stops, strict=True)}
+    return {name: slice(*ends) for name, *ends in zip(sizes, starts, stops, strict=True)}
 
 
-def _of_cameras(rig: Rig) -> Iterator[str]:
+def _sizes_of_cameras(rig: Rig) -> Iterator[tuple[str, int]]:
+    """Components of mountings (rotation, translation) and lenses (fx, fy, cx, cy; distortion)."""
     for c, mounted in enumerate(rig.cameras):
-        yield f"e{c}"
+        yield f"e{c}", 6
         if mounted.camera.gtsam_calibration() is not None:
-            yield f"k{c}"
+            yield f"k{c}", 4
+            if mounted.camera.coefficients:
+                yield f"d{c}", len(mounted.camera.coefficients)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -82,7 +83,12 @@ class CalibrationEquations:
         return cls(information, np.sum([part.gradient for part in parts], axis=0))
 
     def estimate(
-        self, rig: Rig, config: CalibrationConfig, stamp_ns: int, nominal: Rig | None = None
+        self,
+        rig: Rig,
+        config: CalibrationConfig,
+        stamp_ns: int,
+        nominal: Rig | None = None,
+        only: Container[str] | None = None,
     ) -> CalibrationEstimate:
         """The calibration after the step, with its covariance.
 
@@ -91,17 +97,23 @@ class CalibrationEquations:
             config: prior standard deviations.
             stamp_ns: time of the estimate.
             nominal: the calibration that the prior is about; `rig` if not said.
+            only: the variables that are estimated; the others are right then. All if not said.
         """
         columns = variables_of(rig)
         prior = np.concatenate(
             [prior_sigmas(name[0], rig.cameras[int(name[1:])].camera, config) for name in columns]
         )
-        covariance = np.asarray(np.linalg.inv(self.information + np.diag(prior**-2.0)), np.float64)
+        free = {name: own for name, own in columns.items() if only is None or name in only}
+        among = np.ix_(
+            *2 * [np.concatenate([np.arange(own.start, own.stop) for own in free.values()])]
+        )
+        covariance = np.zeros_like(self.information)
+        covariance[among] = np.linalg.inv((self.information + np.diag(prior**-2.0))[among])
         nominal = nominal or rig
         away = np.concatenate([_difference(name, rig, nominal) for name in columns])
         step = covariance @ (self.gradient + prior**-2.0 * away)
         moved = _moved(rig, {name: step[own] for name, own in columns.items()})
-        blocks = {name: covariance[own, own] for name, own in columns.items()}
+        blocks = {name: covariance[own, own] for name, own in free.items()}
         by_baselines = _baseline_rows(moved)
         variances = np.einsum("ci,ij,cj->c", by_baselines, covariance, by_baselines)
         return CalibrationEstimate(stamp_ns, nominal, moved, blocks, np.sqrt(variances).tolist())
@@ -175,10 +187,12 @@ class CalibrationColumns:
             rows = np.flatnonzero(obs.camera == c)
             adjoint = mounted.body_T_camera.AdjointMap()
             J[rows, :, columns[f"e{c}"]] = images.by_pose[rows] @ adjoint
+            # where predicted: what was measured has errors in common with the residuals
+            predicted, weights = images.normalized[rows], images.weights[rows, None, None]
             if f"k{c}" in columns:
-                # where predicted: what was measured has errors in common with the residuals
-                by_lens = mounted.camera.by_intrinsics(images.normalized[rows])
-                J[rows, :, columns[f"k{c}"]] = images.weights[rows, None, None] * by_lens
+                J[rows, :, columns[f"k{c}"]] = weights * mounted.camera.by_intrinsics(predicted)
+            if f"d{c}" in columns:
+                J[rows, :, columns[f"d{c}"]] = weights * mounted.camera.by_coefficients(predicted)
         return J
 
 
@@ -203,6 +217,8 @@ def _difference(name: str, rig: Rig, nominal: Rig) -> FloatArray:
     if name.startswith("e"):
         step = one.body_T_camera.localCoordinates(other.body_T_camera)
         return np.asarray(step, dtype=np.float64)
+    if name.startswith("d"):
+        return np.subtract(other.camera.coefficients, one.camera.coefficients)
     return other.camera.intrinsics - one.camera.intrinsics
 
 
@@ -214,6 +230,9 @@ def _moved(rig: Rig, steps: dict[str, FloatArray]) -> Rig:
         if f"k{c}" in steps:
             fx, fy, cx, cy = (lens.intrinsics + steps[f"k{c}"]).tolist()
             lens = replace(lens, fx=fx, fy=fy, cx=cx, cy=cy)
+        if f"d{c}" in steps:
+            coefficients = np.add(lens.coefficients, steps[f"d{c}"])
+            lens = replace(lens, coefficients=tuple(coefficients.tolist()))
         return replace(
             mounted,
             camera=lens,

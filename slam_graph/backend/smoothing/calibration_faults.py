@@ -17,9 +17,12 @@ _SIGMAS, _SIGMAS_BASELINE = 6.0, 4.5
 which no error of the world or the body is mixed with."""
 _TURN_RAD, _MOVE_M = np.deg2rad(0.2), 0.015
 _FOCAL, _CENTRE_PX = 0.005, 3.0
-_OFFSET_S, _BASELINE = 0.0015, 0.007
+_DISTORTION_PX = 1.0
+_OFFSET_S, _BASELINE = 0.0015, 0.008
 """It must also be larger than these: smaller ones hardly matter, and no calibration is better.
 Focal lengths and baselines are relative."""
+_GRID = 12
+"""Rows and columns of points by which distortions are compared."""
 _HARMFUL = 2.0
 """A difference of so many times these limits may harm: with a camera turned by 0.5° the error of
 V1_02 is three times as large, with 0.3° twice."""
@@ -83,6 +86,7 @@ class CalibrationFault:
 _SETTINGS = {
     "e": "backend.calibration.extrinsics",
     "k": "backend.calibration.intrinsics",
+    "d": "backend.calibration.distortion",
     "t": "backend.calibration.time_offset",
 }
 """By the first letter of a variable."""
@@ -113,6 +117,21 @@ def _baseline(found: CalibrationEstimate, number: int) -> _Difference:
     return replace(off, fewest=_SIGMAS_BASELINE)
 
 
+def _distortion(found: CalibrationEstimate, number: int) -> _Difference:
+    """How far the distortion is off: the root mean square by which points of the image move."""
+    old, new = (rig.cameras[number].camera for rig in (found.nominal, found.rig))
+    across = (np.arange(_GRID) + 0.5) / _GRID
+    x, y = np.meshgrid(across * old.width, across * old.height)
+    points, inside = old.visible(np.column_stack([x.ravel(), y.ravel()]))
+    by_coefficients = old.by_coefficients(points[inside])
+    moments = np.einsum("nij,nik->jk", by_coefficients, by_coefficients) / len(by_coefficients)
+    in_px = np.linalg.cholesky(moments).T
+    change = in_px @ np.subtract(new.coefficients, old.coefficients)
+    what = f"the distortion of cam{number} is {{:.1f}} ± {{:.1f}} px off"
+    covariance = in_px @ found.covariances[f"d{number}"] @ in_px.T
+    return _Difference.of(what, change, covariance, _DISTORTION_PX)
+
+
 def _differences(found: CalibrationEstimate, name: str) -> Iterator[_Difference]:
     """How far a variable is from its calibration."""
     covariance, number = found.covariances[name], int(name[1:])
@@ -129,6 +148,8 @@ def _differences(found: CalibrationEstimate, name: str) -> Iterator[_Difference]
         yield _Difference.of(what, step[3:], covariance[3:, 3:], _MOVE_M, 1e-3)
         if number and found.baseline_sigmas_m:
             yield _baseline(found, number)
+    elif name.startswith("d"):
+        yield _distortion(found, number)
     else:
         focal, change = old.camera.intrinsics[:2], new.camera.intrinsics - old.camera.intrinsics
         what = f"the focal lengths of cam{number} are {{:.1f}} ± {{:.1f}} % off"

@@ -78,6 +78,7 @@ class FinalBa:
         calibration: what the recording says of the rig, by one step from the calibration it was
             adjusted with; None if that is not known.
         checked: the equations that this comes from.
+        fitting: the calibration with what is clearly off corrected; None if nothing is.
         within: (N, 6, 6) pose covariances as those of the history, but relative to position and yaw
             of a state of the same world; None where all states are in one.
     """
@@ -91,6 +92,7 @@ class FinalBa:
     within: FloatArray | None = None
     calibration: CalibrationEstimate | None = None
     checked: CalibrationEquations | None = None
+    fitting: Rig | None = None
 
     @property
     def calibration_faults(self) -> list[CalibrationFault]:
