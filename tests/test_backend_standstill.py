@@ -275,3 +275,34 @@ def test_a_stop_during_a_flight_loses_nothing(algorithm: str) -> None:
     before = int(np.flatnonzero(stopped)[0]) - 1
     assert np.max(error[stopped]) < error[before] + 0.01
     assert np.max(sigma[stopped]) < 1.5 * sigma[before] + 0.01
+
+
+def test_frames_that_may_stand_are_found_without_looking_at_each() -> None:
+    """None is left out for which the detector finds standstill, and those in motion are."""
+    config, features = ZeroVelocityConfig(), 40
+    times_s = np.arange(0.0, 8.0, FRAME_S)
+    moved_px = 60.0 * np.clip(times_s - 2.0, 0.0, 3.0)  # still, in motion for 3 s, still
+    rng = np.random.default_rng(0)
+    home = rng.uniform(50.0, 400.0, (features, 2))
+    pixels = home + moved_px[:, None, None] + rng.normal(0.0, 0.3, (len(times_s), features, 2))
+    stamps_ns = np.round(times_s * 1e9).astype(np.int64)
+    imu = ImuBuffer()
+    samples_ns = np.arange(-1_000_000_000, 9_000_000_000, 5_000_000)
+    accel = np.tile([0.0, 0.0, 9.8], (len(samples_ns), 1)) + rng.normal(
+        0.0, 0.05, (len(samples_ns), 3)
+    )
+    imu.add(ImuData(samples_ns, rng.normal(0.0, 0.01, accel.shape), accel))
+    detector = StandstillDetector(config)
+    still = []
+    for stamp_ns, seen in zip(stamps_ns.tolist(), pixels, strict=True):
+        observed = FeatureObservations(np.arange(features), seen, seen / 400.0)
+        frame = FeatureFrame(stamp_ns, (observed,))
+        still.append(detector.add_frame(imu, stamp_ns, frame) is not None)
+    frames = np.repeat(np.arange(len(times_s)), features)
+    ids = np.tile(np.arange(features), len(times_s))
+    may = StandstillDetector(config).may_stand(stamps_ns, frames, ids, pixels.reshape(-1, 2))
+    assert np.any(still)
+    assert np.all(may[still])
+    in_motion = (times_s > 2.5) & (times_s < 5.0)
+    assert not may[in_motion].any()
+    assert not may[times_s < config.window_s - 1e-9].any()

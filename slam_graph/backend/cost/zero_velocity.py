@@ -22,7 +22,7 @@ import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import V, X
 
-from slam_graph.arrays import FloatArray, IntArray, ascending_union, median
+from slam_graph.arrays import BoolArray, FloatArray, IntArray, ascending_union, median
 from slam_graph.backend.backend_config import ZeroVelocityConfig
 from slam_graph.backend.cost.feature_tracks import is_in
 from slam_graph.backend.cost.robust_loss import MEDIAN_1D
@@ -134,6 +134,41 @@ class StandstillDetector:
         elif self.since_ns is None:
             self.since_ns = self._recent[0][0]
         return velocity_sigma
+
+    def may_stand(
+        self, stamps_ns: IntArray, frames: IntArray, ids: IntArray, pixels: FloatArray
+    ) -> BoolArray:
+        """Of which frames (F,) the detector can say at all that nothing moves.
+
+        If less than a third of the features are where they were at the beginning of the window, it
+        does not, whatever the noise of the tracks. That rules nearly all frames of a flight out.
+
+        Args:
+            stamps_ns: (F,) times of all frames, ascending.
+            frames: (N,) the frame of each observation of the first camera, ascending.
+            ids: (N,) its feature.
+            pixels: (N, 2) where it is.
+        """
+        count, start_ns = len(stamps_ns), stamps_ns - round(self._config.window_s * 1e9)
+        first = stamps_ns.searchsorted(start_ns, side="right") - 1
+        order = np.argsort(ids, kind="stable")
+        frames, ids = frames[order], ids[order]
+        tracks = np.cumsum(np.diff(ids, prepend=ids[:1]) != 0)
+        keys = tracks * count + frames  # ascending
+        wanted = tracks * count + first[frames]
+        there = np.minimum(keys.searchsorted(wanted), len(keys) - 1)
+        common = np.flatnonzero((keys[there] == wanted) & (first[frames] >= 0))
+        frames, now, before = frames[common], order[common], order[there[common]]
+        motion = pixels[now] - pixels[before]
+        noisiest = StandstillDetector(self._config, self._max_disparity_px)
+        noisiest.noise_px, motion_px = _MAX_NOISE_PX, self._max_disparity_px
+        limit_px = max(
+            noisiest._limit_px(motion_px, 0.5, MIN_FEATURES),
+            noisiest._limit_px(motion_px / _DYNAMIC_RATIO, _STATIC_SHARE, MIN_FEATURES),
+        )
+        static = np.hypot(motion[:, 0], motion[:, 1]) < limit_px
+        seen, near = (np.bincount(rows, minlength=count) for rows in (frames, frames[static]))
+        return (seen >= MIN_FEATURES) & (near >= _STATIC_SHARE * (seen - 1))
 
     def add_dynamic(self, ids: IntArray) -> None:
         """Add features (N,) that were found to be dynamic in another way."""

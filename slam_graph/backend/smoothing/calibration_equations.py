@@ -24,7 +24,7 @@ from dataclasses import dataclass, replace
 import gtsam
 import numpy as np
 
-from slam_graph.arrays import FloatArray
+from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.backend.backend_config import CalibrationConfig
 from slam_graph.backend.online_calibration import prior_sigmas, rolling_motion
 from slam_graph.backend.smoothing.recording_cost import (
@@ -151,49 +151,56 @@ class CalibrationColumns:
         images, keyframes = linear.images, len(linear.chain.gradient)
         width = variables_of(self.rig)["t0"].stop
         H, g = np.zeros((width, width)), np.zeros(width)
-        by_poses = np.zeros((width, keyframes, 6))
-        by_points = np.zeros((width, len(images.obs.ids), 3))
+        by_poses = np.zeros((keyframes, 6, width))
+        by_points = np.zeros((len(images.obs.ids), 3, width))
         for first in range(0, len(images.obs), _BLOCK):
             part = images.rows(np.arange(first, min(first + _BLOCK, len(images.obs))))
-            J = self._jacobians(part)
-            for k in range(width):
-                by_pose, by_point = replace(part, r=J[:, :, k]).gradient(keyframes)
-                by_poses[k] += by_pose
-                by_points[k] += by_point
-            rows = J.reshape(-1, width)
-            H += rows.T @ rows
-            g += rows.T @ part.r.ravel()
-        T, B = np.empty((by_points[0].size, width)), np.zeros((keyframes, STATE, width))
-        for k in range(width):
-            reduced, t = features.reduced(by_poses[k], by_points[k])
-            T[:, k], B[:, :6, k] = t.ravel(), reduced
+            for camera in range(len(self.rig.cameras)):
+                own = part.rows(np.flatnonzero(part.obs.camera == camera))
+                columns, J = self._jacobians(own, camera)
+                by_pose, by_point = own.products(J, keyframes)
+                by_poses[:, :, columns] += by_pose
+                by_points[:, :, columns] += by_point
+                rows = J.reshape(-1, len(columns))
+                H[np.ix_(columns, columns)] += rows.T @ rows
+                g[columns] += rows.T @ own.r.ravel()
+        reduced, t = features.reduced(by_poses, by_points)
+        T, B = t.reshape(-1, width), np.zeros((keyframes, STATE, width))
+        B[:, :6] = reduced
         by_state = linear.chain.gradient.copy()
         reduced, t = features.reduced(*images.gradient(keyframes))
         by_state[:, :6] += reduced
         if linear.fixes is not None and features.fixes is not None:
             by_state[:, :6] += features.fixes.reduced(*linear.fixes.gradient(keyframes))
-        own = B.reshape(-1, width)
-        held = states.times_covariance(B).reshape(own.shape)
+        own_columns = B.reshape(-1, width)
+        held = states.times_covariance(B).reshape(own_columns.shape)
         return CalibrationEquations(
-            H - T.T @ T - own.T @ held, g - T.T @ t.ravel() - held.T @ by_state.ravel()
+            H - T.T @ T - own_columns.T @ held, g - T.T @ t.ravel() - held.T @ by_state.ravel()
         )
 
-    def _jacobians(self, images: LinearReprojection) -> FloatArray:
-        """Whitened derivatives (N, 2, n) of the pixels by the parameters."""
-        obs, columns = images.obs, variables_of(self.rig)
-        J = np.zeros((len(obs), 2, columns["t0"].stop))
-        J[:, :, -1] = np.einsum("nij,nj->ni", images.by_pose, self.rates[obs.frame])
-        for c, mounted in enumerate(self.rig.cameras):
-            rows = np.flatnonzero(obs.camera == c)
-            adjoint = mounted.body_T_camera.AdjointMap()
-            J[rows, :, columns[f"e{c}"]] = images.by_pose[rows] @ adjoint
-            # where predicted: what was measured has errors in common with the residuals
-            predicted, weights = images.normalized[rows], images.weights[rows, None, None]
-            if f"k{c}" in columns:
-                J[rows, :, columns[f"k{c}"]] = weights * mounted.camera.by_intrinsics(predicted)
-            if f"d{c}" in columns:
-                J[rows, :, columns[f"d{c}"]] = weights * mounted.camera.by_coefficients(predicted)
-        return J
+    def _jacobians(self, images: LinearReprojection, camera: int) -> tuple[IntArray, FloatArray]:
+        """Whitened derivatives of the pixels of a camera by the parameters that they depend on.
+
+        Args:
+            images: observations of this camera only.
+            camera: its number.
+
+        Returns:
+            Columns (m,) of these parameters, and the derivatives (N, 2, m).
+        """
+        columns, mounted = variables_of(self.rig), self.rig.cameras[camera]
+        own = (f"e{camera}", f"k{camera}", f"d{camera}", "t0")
+        names = [name for name in own if name in columns]
+        parts = [images.by_pose @ mounted.body_T_camera.AdjointMap()]
+        # where predicted: what was measured has errors in common with the residuals
+        predicted, weights = images.normalized, images.weights[:, None, None]
+        if f"k{camera}" in columns:
+            parts.append(weights * mounted.camera.by_intrinsics(predicted))
+        if f"d{camera}" in columns:
+            parts.append(weights * mounted.camera.by_coefficients(predicted))
+        parts.append(images.by_pose @ self.rates[images.obs.frame][:, :, None])
+        chosen = [np.arange(columns[name].start, columns[name].stop) for name in names]
+        return np.concatenate(chosen), np.concatenate(parts, axis=2)
 
 
 def _baseline_rows(rig: Rig) -> FloatArray:

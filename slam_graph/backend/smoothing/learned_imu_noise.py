@@ -233,7 +233,7 @@ def _learned(
         for _ in range(_ROUNDS):
             if not factors.learn_noise(inertial, values, known.times_covariance):
                 break
-            inertial = factors.inertial(values)
+            inertial = factors.reweighted(inertial, values)
             chain = _chain(_with_gauge(inertial, factors, values), values)
             known = states = images.factor(chain)
             values = moved_states(values, images.step(known, chain))

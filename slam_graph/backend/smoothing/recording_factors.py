@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from itertools import pairwise
+from typing import Any
 
 import gtsam
 import numpy as np
@@ -35,6 +36,7 @@ from slam_graph.backend.smoothing.imu_noise_estimation import (
     TimesCovariance,
     variance_ratios,
 )
+from slam_graph.backend.smoothing.imu_noise_shares import noise_shares
 from slam_graph.backend.smoothing.recording_segment import RecordingSegment
 from slam_graph.backend.smoothing.smoothing_config import FinalBaConfig
 from slam_graph.sensors import Rig
@@ -129,6 +131,8 @@ GYRO_BIAS_SIGMA = 0.05
 """Prior on the first gyroscope bias, rad/s: loose, as the estimate of a filter after its start."""
 ACCEL_BIAS_SIGMA = 0.3
 """Prior on the first accelerometer bias, m/s²: loose, as above."""
+_LEAST_PART = 0.02
+"""Least part of a variance of the IMU to which it is reduced without preintegration."""
 
 
 class RecordingFactors:
@@ -168,13 +172,48 @@ class RecordingFactors:
         frames = [segment.noise[i + 1 : j + 1] for i, j in pairwise(segment.keyframes.tolist())]
         self._learned = [np.sqrt(np.mean(noise**2, axis=0)).tolist() for noise in frames]
         longest_s = backend.noise.max_imu_gap_s
+        self._preintegrated = self._assumed = np.zeros((len(samples), 4))
+        self._shares: FloatArray | None = None
         self._gaps = [segment.imu.largest_gap_s(*interval) > longest_s for interval in between]
 
     def inertial(self, values: gtsam.Values) -> gtsam.NonlinearFactorGraph:
         """Priors, IMU and zero-velocity factors, preintegrated at the biases of `values`."""
         aiding = self._segment.aiding
         other = [*aiding.fixes, *aiding.odometry]
+        self._preintegrated = self._assumed = self._variances()
+        self._shares = None
         return _graph(self._prior(values) + self._dynamics(values) + other)
+
+    def reweighted(
+        self, inertial: gtsam.NonlinearFactorGraph, values: gtsam.Values
+    ) -> gtsam.NonlinearFactorGraph:
+        """The factors under the noise that was learned since they were made.
+
+        Samples stay preintegrated at the same biases, unless the noise has become so much smaller
+        that it would be a small difference of large numbers.
+
+        Args:
+            inertial: what `inertial`, or this, gave last.
+            values: biases at which samples are preintegrated otherwise.
+        """
+        if np.any(self._variances() < _LEAST_PART * self._preintegrated):
+            return self.inertial(values)
+        found = [inertial.at(i) for i in range(inertial.size())]
+        factors = {i: f for i, f in enumerate(found) if isinstance(f, gtsam.CombinedImuFactor)}
+        if self._shares is None:
+            biases = [f.preintegratedMeasurements().biasHat() for f in factors.values()]
+            self._shares = noise_shares(
+                [steps.durations_s for steps in self._steps],
+                [s.gyro - b.gyroscope() for s, b in zip(self._steps, biases, strict=True)],
+                [s.accel - b.accelerometer() for s, b in zip(self._steps, biases, strict=True)],
+            )
+        before, self._assumed = self._assumed, self._variances()
+        change = np.einsum("mk,mkij->mij", self._assumed - before, self._shares)
+        for (i, factor), more in zip(factors.items(), change, strict=True):
+            model: Any = factor.noiseModel()
+            noise = gtsam.noiseModel.Gaussian.Covariance(model.covariance() + more)
+            found[i] = factor.cloneWithNewNoiseModel(noise)
+        return _graph(found)
 
     def gauge(self, values: gtsam.Values, sigma: float = DEFINED_SIGMA) -> gtsam.NonlinearFactor:
         """A prior that fixes position and yaw of the anchor, or all of its pose without an IMU.
@@ -274,6 +313,17 @@ class RecordingFactors:
         scale = IMU_GAP_SCALE if self._gaps[k] else 1.0
         gyro, accel = self.noise.white(*self._learned[k])
         return self._backend.noise.imu_scale, scale * gyro, scale * accel
+
+    def _variances(self) -> FloatArray:
+        """(K-1, 4) squared densities between the keyframes, as `noise_shares` has them."""
+        calibrated = self.noise.walks(self._rig.imu)
+        densities = []
+        for k, change in enumerate(self._changes):
+            imu, (scale, gyro, accel) = change.added_to(calibrated), self._noise_factors(k)
+            white = gyro * imu.gyro_noise_density, accel * imu.accel_noise_density
+            walks = imu.accel_random_walk, imu.gyro_random_walk
+            densities.append([scale * density for density in (*white, *walks)])
+        return np.array(densities).reshape(-1, 4) ** 2
 
     def _dynamics(self, values: gtsam.Values) -> list[gtsam.NonlinearFactor]:
         """IMU factors between consecutive keyframes, and zero-velocity factors."""

@@ -113,7 +113,7 @@ class BundleAdjustment:
         self.iterations = self._passes = 0
         self._sigma_px, self._inefficiency = backend.noise.pixel_sigma, 1.0
         self._values, self._shared = values_of(start.states), segment.aiding.shared()
-        self._given = values_of(start.states if loose is None else loose.given)
+        self._given = start.states if loose is None else loose.given
         self._adjusted = loose is not None
         self._factor: EliminatedStates | None = None
         self._note_motions()
@@ -341,10 +341,11 @@ class BundleAdjustment:
         Args:
             obs: that are in the cost.
         """
-        poses = stacked_poses(self._given, obs.frames)
+        states = values_of(self._given)
+        poses = stacked_poses(states, obs.frames)
         points, good = triangulated(obs, poses, self._projection, self._backend)
         points[~good] = self._minimum.estimates.points[~good]
-        given = Estimates(self._given, points, self._segment.aiding.shared())
+        given = Estimates(states, points, self._segment.aiding.shared())
         return self._minimum.cost.value(given)
 
     def _equations(self) -> PoseEquations:

@@ -103,9 +103,9 @@ def read_segment(
     imu.add(log.samples(first, stop, rig))
     stamps_ns = log.frames_ns[first:stop] + round(rig.pose_offset_s * 1e9)
     counts, rows = log.features(first, stop)
-    sigmas = _still_sigmas(StandstillDetector(standstill), imu, stamps_ns, counts, rows)
     image = np.repeat(np.arange(counts.size), counts.ravel())
     frames, cameras = np.divmod(image, counts.shape[1])
+    sigmas = _still_sigmas(standstill, imu, stamps_ns, frames, rows, cameras == 0)
     points = _recalibrated(np.hstack([rows["pixel"], rows["normalized"]]), cameras, log, rig)
     return RecordingSegment(
         stamps_ns,
@@ -118,26 +118,49 @@ def read_segment(
 
 
 def _still_sigmas(
-    detector: StandstillDetector,
+    config: ZeroVelocityConfig,
     imu: ImuBuffer,
     stamps_ns: IntArray,
-    counts: IntArray,
+    frames: IntArray,
     rows: NDArray[np.void],
+    compared: BoolArray,
 ) -> FloatArray:
     """Standard deviations (N,) of the velocity of frames from zero, m/s; NaN where they move.
 
+    The detector sees only frames that may stand still, and those before them that it compares
+    them with: in flight there are hardly any.
+
     Args:
-        detector: sees the frames.
+        config: settings of the detector.
         imu: samples over all of these times.
         stamps_ns: (N,) of the frames.
-        counts: see `FrameLog.features`.
-        rows: see `FrameLog.features`.
+        frames: (M,) the frame of each observation.
+        rows: (M,) see `FrameLog.features`.
+        compared: (M,) which observations are those of the first camera.
     """
-    ends, sigmas = np.cumsum(counts.sum(axis=1)), np.full(len(stamps_ns), np.nan)
-    for k, begin in enumerate(ends - counts.sum(axis=1)):
-        own = rows[begin : begin + counts[k, 0]]
-        seen = FeatureObservations(own["id"], own["pixel"], own["normalized"])
-        stamp_ns = int(stamps_ns[k])
+    sigmas = np.full(len(stamps_ns), np.nan)
+    if not config.enabled:
+        return sigmas
+    rows, frames = rows[compared], frames[compared]
+    begins = frames.searchsorted(np.arange(len(stamps_ns) + 1))
+    ids, pixels, normalized = (
+        np.ascontiguousarray(rows[key]) for key in ("id", "pixel", "normalized")
+    )
+    detector, last = StandstillDetector(config), -1
+    still = np.flatnonzero(detector.may_stand(stamps_ns, frames, ids, pixels))
+    window_ns = round(config.window_s * 1e9)
+    # the noise of the tracks in a frame is that of it and of the two before
+    first = stamps_ns.searchsorted(stamps_ns[still] - window_ns, side="right") - 3
+    needed = np.zeros(len(stamps_ns) + 1, np.int64)
+    np.add.at(needed, np.maximum(first, 0), 1)
+    np.subtract.at(needed, still + 1, 1)
+    for k, is_needed in enumerate((np.cumsum(needed[:-1]) > 0).tolist()):
+        if not is_needed and len(detector.dynamic) == 0:
+            continue
+        if k != last + 1:
+            detector = StandstillDetector(config)
+        own, stamp_ns, last = slice(begins[k], begins[k + 1]), int(stamps_ns[k]), k
+        seen = FeatureObservations(ids[own], pixels[own], normalized[own])
         sigma = detector.add_frame(imu, stamp_ns, FeatureFrame(stamp_ns, (seen,)))
         sigmas[k] = np.nan if sigma is None else sigma
     return sigmas

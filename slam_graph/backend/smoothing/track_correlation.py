@@ -32,6 +32,8 @@ _TRACKS = 200
 _LEAST_OBSERVATIONS, _MOST_OBSERVATIONS = 8, 64
 """Shorter tracks tell nothing, as their points follow their errors. Of longer ones the first
 observations are taken, which is enough, as the time grows with the cube of their number."""
+_AT_ONCE = 50
+"""So many tracks are taken at once: more of them take memory, and no less time."""
 _CORRELATIONS = np.concatenate([[0.0], np.arange(0.1, 0.96, 0.05)])
 """Values of ρ between which expected sums are interpolated. Errors that are still slower hardly
 change within a track, and its point follows them."""
@@ -54,11 +56,12 @@ def statistical_inefficiency(linear: LinearReprojection) -> float:
     if len(longest) == 0:
         return 1.0
     sums = np.zeros((2, 1 + len(_CORRELATIONS)))
-    for track in longest:
-        begin = starts[track]
-        rows = slice(begin, begin + min(counts[track], _MOST_OBSERVATIONS))
-        residuals, by_point = linear.r[rows], linear.by_point[rows]
-        sums += _sums(residuals, by_point, obs.camera[rows], obs.frame[rows])
+    sizes = np.minimum(counts[longest], _MOST_OBSERVATIONS)
+    for size in np.unique(sizes).tolist():  # tracks of the same length at once
+        same = starts[longest[sizes == size]]
+        for first in range(0, len(same), _AT_ONCE):
+            rows = same[first : first + _AT_ONCE, None] + np.arange(size)
+            sums += _sums(linear.r[rows], linear.by_point[rows], obs.camera[rows], obs.frame[rows])
     (square, *squares), (product, *products) = sums
     ratios = np.divide(products, squares)
     correlation = float(np.interp(product / square, ratios, _CORRELATIONS))
@@ -69,17 +72,31 @@ def statistical_inefficiency(linear: LinearReprojection) -> float:
 def _sums(
     residuals: FloatArray, by_point: FloatArray, camera: IntArray, frame: IntArray
 ) -> FloatArray:
-    """Sums (2, 1 + C) of squares and of neighbours: of a track, and expected for each ρ."""
-    Q, _ = np.linalg.qr(by_point.reshape(-1, 3))
-    P = np.eye(len(Q)) - Q @ Q.T
-    e = P @ residuals.ravel()
-    together = camera[:, None] == camera
-    apart = np.abs(frame[:, None] - frame)
-    L = np.kron(np.where(together & (apart == 1), 0.5, 0.0), np.eye(2))
+    """Sums (2, 1 + C) of squares and of neighbours: of some tracks, and expected for each ρ.
+
+    Args:
+        residuals: (T, n, 2) of T tracks with n observations each.
+        by_point: (T, n, 2, 3) their derivatives by the points.
+        camera: (T, n) of the observations.
+        frame: (T, n) their keyframes.
+    """
+    tracks, n = camera.shape
+    Q, _ = np.linalg.qr(by_point.reshape(tracks, 2 * n, 3))
+    errors = residuals.reshape(tracks, 2 * n, 1)
+    e = (errors - Q @ (Q.transpose(0, 2, 1) @ errors)).reshape(tracks, n, 2)
+    together = camera[:, :, None] == camera[:, None]
+    apart = np.abs(frame[:, :, None] - frame[:, None])
+    L = np.where(together & (apart == 1), 0.5, 0.0)
+    of_axes = [np.ascontiguousarray(Q[:, axis::2]) for axis in range(2)]
+    LQ = [L @ part for part in of_axes]
+    S = sum(part.transpose(0, 2, 1) @ own for part, own in zip(of_axes, LQ, strict=True))
+    # L is the same on both axes, so that P L P = L - Q (L Q)ᵀ - (L Q) Qᵀ + Q (Qᵀ L Q) Qᵀ
+    P, PLP = np.broadcast_to(2.0 * np.eye(n), L.shape).copy(), 2.0 * L
+    for part, own in zip(of_axes, LQ, strict=True):
+        P -= part @ part.transpose(0, 2, 1)
+        half = (own - 0.5 * part @ S) @ part.transpose(0, 2, 1)
+        PLP -= half + half.transpose(0, 2, 1)
     powers = _CORRELATIONS ** np.arange(apart.max() + 1)[:, None]
-    expected = []
-    for M in (P, P @ L @ P):
-        products = M[0::2, 0::2] + M[1::2, 1::2]
-        sums = np.bincount(apart[together], products[together], len(powers))
-        expected.append(sums @ powers)
-    return np.column_stack([[e @ e, e @ L @ e], expected])
+    lags = apart.ravel()
+    expected = [np.bincount(lags, (M * together).ravel()) @ powers for M in (P, PLP)]
+    return np.column_stack([[np.sum(e * e), np.sum(e * (L @ e))], expected])
