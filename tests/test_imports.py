@@ -21,6 +21,7 @@ NOT_BEFORE_THE_FIRST_FRAME = (
     *OPTIONAL,
     *DRAWING,
     *("scipy.optimize", "scipy.integrate", "scipy.interpolate", "scipy.ndimage"),
+    *("scipy.sparse", "scipy.spatial.distance", "scipy.special"),
     *("numpy.f2py.f2py2e", "numpy.ma.core", "numpy.polynomial.polynomial", "unittest"),
     "slam_graph.evaluation.absolute_pose_error",
     "slam_graph.backend.smoothing.final_adjustment",
@@ -59,14 +60,25 @@ import sys
 from slam_graph.cli.loading import loading
 with loading():
     import numpy as np
+    from scipy.spatial.transform import Rotation
+    import slam_graph.frontend.camera_tracker, slam_graph.frontend.matching
+assert not {"scipy.spatial.distance", "scipy.special"} & sys.modules.keys()
 assert {"numpy.ma", "numpy.polynomial"} <= sys.modules.keys()
 assert not {"numpy.ma.core", "numpy.polynomial.polynomial"} & sys.modules.keys()
 import numpy.ma.extras
 from numpy.polynomial.polynomial import polyval
 assert polyval(2.0, [1.0, 3.0]) == np.polynomial.Polynomial([1.0, 3.0])(2.0) == 7.0
 assert numpy.ma.extras.average(np.ma.array([1.0, 2.0], mask=[True, False])) == 2.0
+
+import scipy.spatial
+from scipy.spatial.distance import cdist
+assert cdist(np.zeros((1, 2)), np.ones((1, 2))) == np.sqrt(2.0)
+assert "scipy.spatial._kdtree" not in sys.modules
+assert isinstance(scipy.spatial.cKDTree(np.eye(3)).n, int)
+assert "scipy.spatial._kdtree" in sys.modules
+assert scipy.spatial.transform.Rotation is Rotation
 """
-"""Uses parts of NumPy whose import is postponed, by a module of theirs first."""
+"""Uses parts of NumPy and SciPy whose import is postponed, by a module of theirs first."""
 
 
 def imported(*arguments: str, before: str = "") -> set[str]:
@@ -102,6 +114,7 @@ def test_optimization_needs_no_estimator(tmp_path: Path, dimension: int) -> None
 
 def test_help_imports_nothing_heavy() -> None:
     assert not imported("run", "--help").intersection(NOT_FOR_HELP)
+    assert not imported("--help").intersection((*NOT_FOR_HELP, "pydantic"))
 
 
 def test_what_is_postponed_is_there_when_it_is_used() -> None:

@@ -14,9 +14,13 @@ from typing import Any
 
 from slam_graph.interrupts import Interrupts
 
-_POSTPONED = ("f2py", "ma", "polynomial", "testing")
+_POSTPONED = ("numpy.f2py", "numpy.ma", "numpy.polynomial", "numpy.testing")
 """Parts of NumPy that SciPy imports because it copies all names of NumPy. A run hardly ever uses
 them, and they take some 100 ms."""
+
+_POSTPONED_ROOTS = ("scipy.spatial",)
+"""Packages of which a run begins with a part: `scipy.spatial.transform`. The rest, with the special
+functions and sparse matrices that it imports, takes some 100 ms."""
 
 
 @contextmanager
@@ -64,15 +68,29 @@ class _Postponed(ModuleType):
         return getattr(self, name)
 
 
-def _postpone_parts() -> None:
-    """Import the unused parts of NumPy when the first of their names is used."""
-    import numpy as np
+class _PostponedRoot(_Postponed):
+    """A package whose modules are imported without it; it is executed when another name is used.
 
-    for part in _POSTPONED:
-        name = f"numpy.{part}"
+    Its modules may import one another, also those whose names begin with an underscore.
+    """
+
+    def __getattr__(self, name: str) -> Any:
+        module = sys.modules.get(f"{self.__name__}.{name}")  # maybe in the middle of its import
+        if module is not None:
+            return module
+        if name.startswith("_"):
+            raise AttributeError(f"module {self.__name__!r} has no attribute {name!r}", name=name)
+        return super().__getattr__(name)
+
+
+def _postpone_parts() -> None:
+    """Import what a run hardly ever uses of NumPy and SciPy when the first of it is used."""
+    for name in (*_POSTPONED, *_POSTPONED_ROOTS):
+        package, _, part = name.partition(".")
         spec = None if name in sys.modules else find_spec(name)
         if spec is not None:
             module = sys.modules[name] = module_from_spec(spec)
-            del module.__path__  # `import numpy.ma.core` asks for it, which executes the package
-            module.__class__ = _Postponed
-            setattr(np, part, module)
+            if name in _POSTPONED:
+                del module.__path__  # `import numpy.ma.core` asks for it: that executes the package
+            module.__class__ = _Postponed if name in _POSTPONED else _PostponedRoot
+            setattr(sys.modules[package], part, module)

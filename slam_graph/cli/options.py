@@ -11,12 +11,13 @@ from time import perf_counter
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Protocol, TypeVar
 
 import typer
-from pydantic import BaseModel
 
 from slam_graph.cli.loading import loading
 from slam_graph.interrupts import Interrupts
 
 if TYPE_CHECKING:
+    from pydantic import BaseModel
+
     from slam_graph.config import RunConfig
     from slam_graph.datasets import RecordedSequence
 
@@ -286,7 +287,7 @@ def run_settings(
         return load_config(config, overrides or (), **options, **tables)
 
 
-_Policy = TypeVar("_Policy", bound=BaseModel)
+_Policy = TypeVar("_Policy", bound="BaseModel")
 
 
 class _Result(Protocol):

@@ -7,7 +7,7 @@ from __future__ import annotations
 from functools import partial, reduce
 
 import numpy as np
-from scipy.spatial.distance import cdist
+import scipy  # its parts are imported when they are first used
 
 from slam_graph.arrays import BoolArray, FloatArray, IntArray, median
 from slam_graph.frontend.association import Associator
@@ -199,7 +199,7 @@ class CameraTracker:
             np.isin(tracks.ids, self._moving.ids) & np.isfinite(tracks.residual_flow[:, 0])
         )
         if len(old) and len(new):  # it moves as what is nearest on the object
-            nearest = np.argmin(cdist(new.pixels, old.pixels), axis=1)
+            nearest = np.argmin(scipy.spatial.distance.cdist(new.pixels, old.pixels), axis=1)
             new.residual_flow[:] = old.residual_flow[nearest]
         return tracks.joined(new)
 

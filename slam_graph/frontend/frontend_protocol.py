@@ -14,11 +14,12 @@ from typing import Literal, Protocol, runtime_checkable
 
 import numpy as np
 
-from slam_graph.arrays import BoolArray, FloatArray, IntArray
+from slam_graph.arrays import BoolArray, FloatArray, IntArray, ascending_union
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import DataError
 from slam_graph.frontend.frontend_config import DESCRIPTORS, FRONTENDS, FrontendConfig
 from slam_graph.geometry import NavState
+from slam_graph.kernels.ascending import are_among
 from slam_graph.sensors import CameraFrame, FeatureFrame, ImuData, Rig
 
 STANDARD_GRAVITY = 9.81
@@ -193,12 +194,14 @@ class _ReplayFrontend:
                 f"frame {frame.stamp_ns} has features of {len(frame.cameras)} cameras, the rig has "
                 f"{self._cameras}"
             )
-        ids = np.unique(np.concatenate([c.ids for c in frame.cameras]))
-        dropped = np.isin(ids, self._dropped)
+        ids = ascending_union(*(c.ids for c in frame.cameras))
+        dropped = are_among(ids, self._dropped)
+        known = are_among(ids[~dropped], self._seen)
+        tracked, kept = np.count_nonzero(known), len(known)
         self.frame_stats = {
-            "tracked": float(np.count_nonzero(np.isin(ids[~dropped], self._seen))),
-            "new": float(np.count_nonzero(~np.isin(ids[~dropped], self._seen))),
-            "dropped": float(np.count_nonzero(dropped)),
+            "tracked": float(tracked),
+            "new": float(kept - tracked),
+            "dropped": float(len(ids) - kept),
         }
         self._seen = ids
         static = frame.without(self._dropped) if dropped.any() else frame

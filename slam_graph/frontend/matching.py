@@ -8,7 +8,7 @@ from collections import deque
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.spatial.distance import cdist
+import scipy  # its parts are imported when they are first used
 
 from slam_graph.arrays import BoolArray, FloatArray, IntArray
 from slam_graph.frontend.association import Association, Candidates, inside
@@ -51,7 +51,7 @@ def descriptor_distances(a: Vectors, b: Vectors) -> FloatArray:
     The number of bits that differ where they are uint8, Euclidean otherwise.
     """
     if a.dtype != np.uint8:
-        distances: FloatArray = cdist(a, b)
+        distances: FloatArray = scipy.spatial.distance.cdist(a, b)
         return distances
     words_a, words_b = (np.ascontiguousarray(v).view(np.uint64) for v in (a, b))
     bits = np.bitwise_count(words_a[:, None] ^ words_b[None])
@@ -92,11 +92,12 @@ def match(
     if n == 0 or m == 0:
         return np.full(n, -1, np.int64)
     distance = descriptor_distances(features, keypoints)
-    distance[cdist(guess, pixels) > search_radius_px] = np.inf
+    distance[scipy.spatial.distance.cdist(guess, pixels) > search_radius_px] = np.inf
     rows = np.arange(n)
     best = np.argmin(distance, axis=1)
     shortest = distance[rows, best]
-    rivals = np.where(cdist(pixels, pixels)[best] < _SAME_PX, np.inf, distance)
+    apart_px = scipy.spatial.distance.cdist(pixels, pixels)[best]
+    rivals = np.where(apart_px < _SAME_PX, np.inf, distance)
     good = (shortest <= max_distance) & (shortest < _RATIO * np.min(rivals, axis=1))
     if mutual:
         good &= np.argmin(distance, axis=0)[best] == rows
@@ -288,7 +289,8 @@ class DescriptorMatching:
         """Remember the descriptors of new features, which are keypoints."""
         if len(ids) == 0:
             return
-        keypoints = np.argmin(cdist(points, self._current.keypoints.pixels), axis=1)
+        known = self._current.keypoints.pixels
+        keypoints = np.argmin(scipy.spatial.distance.cdist(points, known), axis=1)
         self._current.free[keypoints] = False
         self._update(ids, keypoints)
 

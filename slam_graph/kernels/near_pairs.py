@@ -8,7 +8,6 @@ import math
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.kernels.compilation import compiled
@@ -146,6 +145,8 @@ def nearest(points: _Pixels, places: _Pixels, count: int) -> IntArray:
 
 def nearest_numpy(points: _Pixels, places: _Pixels, count: int) -> IntArray:
     """`nearest` in SciPy."""
+    from scipy.spatial import cKDTree  # it takes a moment to import
+
     rows: IntArray = cKDTree(points).query(places, k=count)[1]
     return rows.reshape(len(places), count)
 

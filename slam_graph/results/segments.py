@@ -14,8 +14,7 @@ from typing import Any, ClassVar, Literal, Protocol
 
 import gtsam
 import numpy as np
-from scipy.sparse import csr_array
-from scipy.sparse.csgraph import connected_components
+import scipy  # its parts are imported when they are first used
 
 from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.geometry import Trajectory
@@ -232,8 +231,10 @@ class Segments:
         places = np.searchsorted(begins_ns, joined_ns, "right") - 1  # of a segment and what follows
         pairs = [(k - 1, k) for k in range(1, len(begins_ns)) if self._all[k].joined_by != "none"]
         first, second = np.vstack([np.maximum(places, 0), np.reshape(pairs, (-1, 2))]).astype(int).T
-        links = csr_array((np.ones(len(first)), (first, second)), shape=(len(begins_ns),) * 2)
-        return np.asarray(connected_components(links, directed=False)[1], np.int64)
+        shape = (len(begins_ns), len(begins_ns))
+        links = scipy.sparse.csr_array((np.ones(len(first)), (first, second)), shape=shape)
+        _, world = scipy.sparse.csgraph.connected_components(links, directed=False)
+        return np.asarray(world, np.int64)
 
     def csv_lines(self, trajectory: Trajectory) -> Iterator[str]:
         """Segments as CSV; times between two of them have no state.

@@ -217,6 +217,8 @@ class TrackSimulator:
 
     def _begin_on_objects(self, tracks: _Tracks, leader: View, pose: _Pose) -> None:
         """Start tracks of all landmarks on moving objects that are seen."""
+        if self._landmarks.static == len(self._landmarks):
+            return  # most flights have none, and the search for tracks of none takes its time
         block = np.arange(self._landmarks.static, len(self._landmarks))
         block = block[~np.isin(block, np.concatenate([t.landmarks for t in self._tracks]))]
         if len(block):

@@ -12,21 +12,21 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass, replace
+from functools import cache
 from typing import ClassVar, TypeAlias
 
 import gtsam
 import numpy as np
+import scipy  # its parts are imported when they are first used
 from gtsam.symbol_shorthand import X
-from scipy.special import chdtri
 
 from slam_graph.arrays import FloatArray
 from slam_graph.backend.backend_config import BackendConfig
 from slam_graph.backend.cost.robust_loss import RobustLoss
 from slam_graph.sensors import AidingData
 
-_GATE = float(np.sqrt(chdtri(3, 0.001)))
-_HUBER = float(np.sqrt(chdtri(3, 0.05)))
-"""Mahalanobis distances of an innovation beyond which a fix is rejected, and counts less."""
+_REJECTED, _REDUCED = 0.001, 0.05
+"""Shares of good fixes that are rejected, and that count less, as their innovation is large."""
 FIX_LOSS = RobustLoss("cauchy", 4.0)
 """The loss in the final adjustment: a good fix counts for 0.84, one that is off by 10 σ for
 0.14."""
@@ -195,13 +195,19 @@ class FixGate:
         H, innovation = whitened.jacobian()
         S = H @ known @ H.T + np.eye(3)
         distance = float(np.sqrt(innovation @ np.linalg.solve(S, innovation)))
-        rejected = distance > _GATE
+        rejected = distance > _farthest(_REJECTED)
         self._recent.append(rejected)
         self.tested += 1
         if rejected and sum(self._recent) <= _MOST_REJECTED:
             self.rejected += 1
             return 0.0
-        return min(1.0, _HUBER / max(distance, 1e-12))
+        return min(1.0, _farthest(_REDUCED) / max(distance, 1e-12))
+
+
+@cache
+def _farthest(share: float) -> float:
+    """The Mahalanobis distance of an innovation beyond which there is such a share of good ones."""
+    return float(np.sqrt(scipy.special.chdtri(3, share)))
 
 
 def pose_between(first: gtsam.Pose3, last: gtsam.Pose3, share: float) -> gtsam.Pose3:

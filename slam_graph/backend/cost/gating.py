@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
+import scipy  # its parts are imported when they are first used
 from numpy.typing import NDArray
-from scipy.special import gammainc, gammaincinv
 
 from slam_graph.arrays import BoolArray, FloatArray
 from slam_graph.backend.cost.feature_factors import WhitenedObservations
@@ -203,10 +203,11 @@ def threshold(dof: NDArray[np.int64], confidence: float) -> FloatArray:
 def _mean_below(dof: int, limit: float) -> float:
     """The mean k F(k + 2, q) / F(k, q) of a χ² variable of k degrees of freedom, cut off at q."""
     k, q = 0.5 * dof, 0.5 * limit
-    return float(dof * gammainc(k + 1.0, q) / gammainc(k, q))
+    return float(dof * scipy.special.gammainc(k + 1.0, q) / scipy.special.gammainc(k, q))
 
 
 @lru_cache(maxsize=64)
 def _quantiles(largest: int, confidence: float) -> FloatArray:
     # the quantile of χ² with k degrees of freedom is 2 P⁻¹(k/2, p), P the incomplete gamma function
-    return np.concatenate([[0.0], 2.0 * gammaincinv(0.5 * np.arange(1, largest + 1), confidence)])
+    halves = scipy.special.gammaincinv(0.5 * np.arange(1, largest + 1), confidence)
+    return np.concatenate([[0.0], 2.0 * halves])

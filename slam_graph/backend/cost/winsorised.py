@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.special import gammainc, gammaincinv
+import scipy  # its parts are imported when they are first used
 
 from slam_graph.arrays import FloatArray
 
@@ -19,6 +19,7 @@ def winsorised(squares: FloatArray, dof: FloatArray, quantile: float) -> FloatAr
         quantile: of these.
     """
     half = 0.5 * dof
-    largest = gammaincinv(half, quantile)
-    expected = gammainc(half + 1.0, largest) + largest / half * (1.0 - quantile)
+    largest = scipy.special.gammaincinv(half, quantile)
+    below = scipy.special.gammainc(half + 1.0, largest)
+    expected = below + largest / half * (1.0 - quantile)
     return np.asarray(np.minimum(squares, largest / half) / expected, dtype=np.float64)
