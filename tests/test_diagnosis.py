@@ -121,15 +121,18 @@ def test_a_quick_diagnosis_rules_out_what_it_would_have_seen(stereo_tracks: Reco
     wrong = changed(rig, lambda c: magnified(c, 1.1))
     large = {"focal_length": 0.2, "baseline": 0.7, "mounting": 6.0}
 
-    def look(rig: Rig, seconds: float) -> Diagnosis:
+    def diagnosed(rig: Rig, seconds: float) -> Diagnosis:
         end_ns = frames[0].stamp_ns + round(seconds * 1e9)
         seen = [normalized_by(rig, frame) for frame in frames if frame.stamp_ns < end_ns]
         return Diagnosis.nearby(rig, seen, imu)
 
-    assert look(rig, 14.0).rules_out(large)
-    assert not look(rig, 14.0).rules_out({"mounting": 0.01})  # it is not known so well
-    assert not look(wrong, 14.0).rules_out({"mounting": 6.0})  # something is wrong
-    assert not look(rig, 1.0).rules_out({"focal_length": 0.2})  # too short to be compared
+    assert diagnosed(rig, 14.0).rules_out(large)
+    assert not diagnosed(rig, 14.0).rules_out({"mounting": 0.01})  # it is not known so well
+    assert not diagnosed(wrong, 14.0).rules_out({"mounting": 6.0})  # something is wrong
+    assert not diagnosed(rig, 1.0).rules_out({"focal_length": 0.2})  # too short to be compared
+    found = diagnosed(rig, 14.0).findings
+    assert not Diagnosis([*found, Finding("imu_rate", "warning", "")]).rules_out(large)
+    assert not Diagnosis(found).rules_out(large | {"baseline": 0.3})  # known to 6 % only
 
 
 def test_an_unknown_mounting_is_found_and_no_fault(stereo_tracks: Recorded) -> None:

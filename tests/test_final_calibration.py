@@ -16,10 +16,11 @@ from groups import slow
 from benchmarks.wrong_setups import WronglySetUp, baseline
 from slam_graph import run
 from slam_graph.backend import FinalBa
+from slam_graph.backend.smoothing.calibration_faults import calibration_faults
 from slam_graph.datasets import RecordedSequence, dataset_from_arrays, read_kalibr
 from slam_graph.evaluation import ape
 from slam_graph.results import RunResult
-from slam_graph.sensors import FeatureFrame, ImuData, Rig
+from slam_graph.sensors import CalibrationEstimate, FeatureFrame, ImuData, Rig
 from slam_graph.simulation import simulate
 
 TURN_DEG = 1.0
@@ -146,6 +147,16 @@ def test_a_wrong_baseline_is_named_and_corrected(tmp_path: Path) -> None:
     )
     assert smoothed < 0.4 * causal
     assert result.status == "suspect"
+
+
+def test_cameras_at_one_place_have_no_baseline() -> None:
+    """Such as the faces of an omnidirectional one: nothing is said of it, and nothing fails."""
+    right = flight().rig.cameras[0]
+    moved = replace(right, body_T_camera=right.body_T_camera * gtsam.Pose3.Expmap([0.1] + [0] * 5))
+    nominal, shown = Rig((right, right), flight().rig.imu), Rig((right, moved), flight().rig.imu)
+    found = CalibrationEstimate(0, nominal, shown, {"e1": 1e-6 * np.eye(6)}, (1e-4,))
+    (fault,) = calibration_faults(found)
+    assert "cam1 is turned by 5.73°" in fault.what
 
 
 def test_a_small_offset_that_is_found_late_loses_nothing() -> None:

@@ -296,9 +296,9 @@ def test_a_wrong_setup_under_which_an_estimate_lasts_is_refused_after_some_secon
     data_dir: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Not at the end of a recording that may be long; by a later look if there is none before."""
-    looks = tuple(look_ns for look_ns in verdict._EARLY_CHECKS_NS if look_ns >= after_s * 1e9)
-    monkeypatch.setattr(verdict, "_EARLY_CHECKS_NS", looks)
+    """Not at the end of a recording that may be long; by a later diagnosis if none is before."""
+    later = tuple(ns for ns in verdict._EARLY_CHECKS_NS if ns >= after_s * 1e9)
+    monkeypatch.setattr(verdict, "_EARLY_CHECKS_NS", later)
     path = data_dir / "euroc_inertial/V2_01_easy"
     sequence = simulate(
         trajectory=str(path), real_imu=True, cameras=1, duration_s=40.0, rate_hz=RATE_HZ, seed=0

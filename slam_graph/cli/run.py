@@ -134,8 +134,7 @@ def _overview(metrics: _Table) -> Iterator[tuple[str, str]]:
     if metrics["final_ba"]:
         yield "final BA", _final_ba(metrics["final_ba"])
         if metrics["final_ba"]["calibration_faults"]:
-            off = "; ".join(metrics["final_ba"]["calibration_faults"])
-            yield "calibration", f"{off}; calibration_adjusted.yaml fits better (--calibration)"
+            yield "calibration", "; ".join(metrics["final_ba"]["calibration_faults"])
     if metrics["loop_closure"]:
         table = metrics["loop_closure"]
         found = f"{table['accepted']} accepted of {table['verified']} verified"

@@ -93,7 +93,9 @@ def compare(rig: Rig, parts: list[Part]) -> CameraAndGyroscope:
     problem = RotationProblem(pairs, now.gyroscopes, camera)
     now.fit = _solved(problem, start)
     alike = turning.misfit <= _NOTHING_FITS
-    if now.fit is None or not (alike or _explains(now.fit, problem, _calibrated(camera))):
+    if now.fit is not None and camera.rotation_known:
+        alike = alike or _explains(now.fit, problem, _calibrated(camera))
+    if now.fit is None or not alike:
         now.fit = None
         what = "camera and gyroscope do not turn alike under any mounting"
         fix = "compare the clocks (more than 0.2 s?); mask moving objects; check the matches"
@@ -137,9 +139,9 @@ def _shows_faults(now: CameraAndGyroscope, fit: RotationFit) -> bool:
     return any(finding.severity != "info" for finding in tried.findings)
 
 
-def _explains(fit: RotationFit, problem: RotationProblem, start: Kinematics) -> bool:
-    """Whether next to nothing is left of what does not fit at the start."""
-    return fit.noise_px < _EXPLAINED * problem.noise_px(start)
+def _explains(fit: RotationFit, problem: RotationProblem, calibrated: Kinematics) -> bool:
+    """Whether a fit leaves but a small part of the epipolar distances of the calibration."""
+    return fit.noise_px < _EXPLAINED * problem.noise_px(calibrated)
 
 
 def _calibration_is_better(problem: RotationProblem, start: Kinematics, fit: RotationFit) -> bool:

@@ -14,7 +14,7 @@ from typing import Literal, Protocol, runtime_checkable
 
 import numpy as np
 
-from slam_graph.arrays import BoolArray, FloatArray, IntArray, ascending_union
+from slam_graph.arrays import BoolArray, FloatArray, IntArray
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import DataError
 from slam_graph.frontend.frontend_config import DESCRIPTORS, FRONTENDS, FrontendConfig
@@ -194,7 +194,7 @@ class _ReplayFrontend:
                 f"frame {frame.stamp_ns} has features of {len(frame.cameras)} cameras, the rig has "
                 f"{self._cameras}"
             )
-        ids = ascending_union(*(c.ids for c in frame.cameras))
+        ids = frame.ids
         dropped = are_among(ids, self._dropped)
         known = are_among(ids[~dropped], self._seen)
         tracked, kept = np.count_nonzero(known), len(known)

@@ -158,14 +158,15 @@ class Smoothing(Stage):
             found = _with_all_steps(again.about(nominal, settings.backend), found)
             if not more:
                 break
-        found = replace(found, fitting=fitting)
+        if not found.calibration_faults:  # it was but a little above a limit
+            found = first
         latest = self._result.logs.calibration.latest
         estimated = () if latest is None else latest.covariances  # which the run has found itself
         what = "; ".join(f.what for f in found.calibration_faults if f.variable not in estimated)
         if what:
             corrected = "; the smoothed trajectory has it corrected" if found is not first else ""
             self._diagnostics.warn("calibration_off", what + corrected)
-        return found
+        return replace(found, fitting=fitting)
 
     def _corrected(self, found: backend.FinalBa, nominal: Rig, off: set[str]) -> Rig:
         """The calibration of an adjustment, after a step of what is off; all else is right then.

@@ -101,6 +101,7 @@ class Verdict(Stage):
         self._estimated = self._at_limit = 0  # frames with a state; noise of the IMU at its limit
         self._diagnosis: Diagnosis | None = None  # a quick one of all that is kept
         self._diagnosis_failed = False
+        self._corrected = 0  # starts that were solved again so far
         self._early_checks_ns: tuple[int, ...] = _EARLY_CHECKS_NS  # those to come
         self._started_ns: int | None = None
         self._waits_since_ns: int | None = None
@@ -122,7 +123,9 @@ class Verdict(Stage):
         if frame.restarted:
             self._estimated = self._at_limit = 0
             self._diagnosis, self._diagnosis_failed = None, False
-            self._early_checks_ns = (0,) * frame.initialized + _EARLY_CHECKS_NS
+            corrected = self._diagnostics.counts["start_corrected"]
+            self._early_checks_ns = (0,) * (corrected > self._corrected) + _EARLY_CHECKS_NS
+            self._corrected = corrected
         self._estimated += frame.initialized
         self._at_limit += frame.initialized and frame.imu_noise_at_limit
         if frame.restarted or not frame.initialized:
@@ -230,7 +233,8 @@ class Verdict(Stage):
     def _watch_early(self, lasted_ns: int) -> None:
         """Ask now and then whether the estimate is worth anything, before all frames are there.
 
-        A diagnosis that rules out what would ruin it is the last one of these.
+        A diagnosis that rules out what would ruin it is the last one of these (but for the scale of
+        the gyroscope, which a quick one does not estimate).
 
         Raises:
             DataError: if what the run was given is certainly wrong, and by so much.

@@ -138,7 +138,7 @@ class StandstillDetector:
     def may_stand(
         self, stamps_ns: IntArray, frames: IntArray, ids: IntArray, pixels: FloatArray
     ) -> BoolArray:
-        """Of which frames (F,) the detector can say at all that nothing moves.
+        """Which frames (F,) may be found to stand still, as long as no feature is dynamic.
 
         If less than a third of the features are where they were at the beginning of the window, it
         does not, whatever the noise of the tracks. That rules nearly all frames of a flight out.

@@ -97,7 +97,8 @@ class CalibrationEquations:
             config: prior standard deviations.
             stamp_ns: time of the estimate.
             nominal: the calibration that the prior is about; `rig` if not said.
-            only: the variables that are estimated; the others are right then. All if not said.
+            only: the variables that are estimated, one at least; the others are right then. All if
+                not said.
         """
         columns = variables_of(rig)
         prior = np.concatenate(
@@ -114,7 +115,7 @@ class CalibrationEquations:
         step = covariance @ (self.gradient + prior**-2.0 * away)
         moved = _moved(rig, {name: step[own] for name, own in columns.items()})
         blocks = {name: covariance[own, own] for name, own in free.items()}
-        by_baselines = _baseline_rows(moved)
+        by_baselines = _baseline_rows(moved) if only is None else np.zeros((0, len(covariance)))
         variances = np.einsum("ci,ij,cj->c", by_baselines, covariance, by_baselines)
         return CalibrationEstimate(stamp_ns, nominal, moved, blocks, np.sqrt(variances).tolist())
 

@@ -20,7 +20,10 @@ _FOCAL, _CENTRE_PX = 0.005, 3.0
 _DISTORTION_PX = 1.0
 _OFFSET_S, _BASELINE = 0.0015, 0.008
 """It must also be larger than these: smaller ones hardly matter, and no calibration is better.
-Focal lengths and baselines are relative."""
+Focal lengths and baselines are relative; of distortions it is the root mean square over the image.
+"""
+_APART_M = 1e-3
+"""The shortest baseline that is compared."""
 _GRID = 12
 """Rows and columns of points by which distortions are compared."""
 _HARMFUL = 2.0
@@ -103,33 +106,39 @@ def calibration_faults(found: CalibrationEstimate) -> list[CalibrationFault]:
     ]
 
 
-def _baseline(found: CalibrationEstimate, number: int) -> _Difference:
-    """How far a camera is from the first one, relative to what is calibrated."""
+def _baseline(found: CalibrationEstimate, number: int) -> Iterator[_Difference]:
+    """How far a camera is from the first one, relative to what is calibrated, if they are apart."""
+    if not number or not found.baseline_sigmas_m:
+        return
     lengths = []
     for rig in (found.nominal, found.rig):
         first, other = (rig.cameras[c].body_T_camera.translation() for c in (0, number))
         lengths.append(float(np.linalg.norm(other - first)))
     was, now = lengths
+    if was < _APART_M:
+        return
     wrong = "short" if now > was else "long"
     what = f"the calibrated baseline of cam{number} is {{:.1f}} ± {{:.1f}} % too {wrong}"
     variance = np.array([[(found.baseline_sigmas_m[number - 1] / was) ** 2]])
     off = _Difference.of(what, np.array([now / was - 1.0]), variance, _BASELINE, 1e-2)
-    return replace(off, fewest=_SIGMAS_BASELINE)
+    yield replace(off, fewest=_SIGMAS_BASELINE)
 
 
-def _distortion(found: CalibrationEstimate, number: int) -> _Difference:
+def _distortion(found: CalibrationEstimate, number: int) -> Iterator[_Difference]:
     """How far the distortion is off: the root mean square by which points of the image move."""
     old, new = (rig.cameras[number].camera for rig in (found.nominal, found.rig))
     across = (np.arange(_GRID) + 0.5) / _GRID
     x, y = np.meshgrid(across * old.width, across * old.height)
     points, inside = old.visible(np.column_stack([x.ravel(), y.ravel()]))
+    if np.count_nonzero(inside) < len(old.coefficients):
+        return
     by_coefficients = old.by_coefficients(points[inside])
     moments = np.einsum("nij,nik->jk", by_coefficients, by_coefficients) / len(by_coefficients)
     in_px = np.linalg.cholesky(moments).T
     change = in_px @ np.subtract(new.coefficients, old.coefficients)
     what = f"the distortion of cam{number} is {{:.1f}} ± {{:.1f}} px off"
     covariance = in_px @ found.covariances[f"d{number}"] @ in_px.T
-    return _Difference.of(what, change, covariance, _DISTORTION_PX)
+    yield _Difference.of(what, change, covariance, _DISTORTION_PX)
 
 
 def _differences(found: CalibrationEstimate, name: str) -> Iterator[_Difference]:
@@ -146,10 +155,9 @@ def _differences(found: CalibrationEstimate, name: str) -> Iterator[_Difference]
         yield _Difference.of(what, step[:3], covariance[:3, :3], _TURN_RAD, np.deg2rad(1.0))
         what = f"cam{number} is {{:.0f}} ± {{:.0f}} mm away from where it is calibrated"
         yield _Difference.of(what, step[3:], covariance[3:, 3:], _MOVE_M, 1e-3)
-        if number and found.baseline_sigmas_m:
-            yield _baseline(found, number)
+        yield from _baseline(found, number)
     elif name.startswith("d"):
-        yield _distortion(found, number)
+        yield from _distortion(found, number)
     else:
         focal, change = old.camera.intrinsics[:2], new.camera.intrinsics - old.camera.intrinsics
         what = f"the focal lengths of cam{number} are {{:.1f}} ± {{:.1f}} % off"

@@ -14,7 +14,7 @@ velocity by its integral, and position by that times τ + dt / 2. What walks add
 them integrate. Noise is the same in all directions, so that its axes do not matter. All of it is in
 the frame of the end, where GTSAM has the residuals.
 
-Shares are right to a thousandth: only what changes of a covariance is taken from them.
+Shares are right to some thousandths: only what changes of a covariance is taken from them.
 """
 
 from __future__ import annotations
@@ -28,6 +28,8 @@ from slam_graph.arrays import FloatArray, skew
 _UNIT = np.eye(3)
 _ROTATION, _POSITION, _VELOCITY = slice(0, 3), slice(3, 6), slice(6, 9)
 _ACCEL_BIAS, _GYRO_BIAS = slice(9, 12), slice(12, 15)
+_AT_ONCE = 2000
+"""Steps of intervals at a time, with those that fill shorter ones up: 10 kB each."""
 
 
 def noise_shares(
@@ -45,7 +47,18 @@ def noise_shares(
         of the residuals of GTSAM's factor: rotation, position, velocity, and both biases,
         accelerometer first.
     """
-    dt, rates, forces = _padded(durations_s, gyro, accel)
+    lengths = np.array([len(seconds) for seconds in durations_s])
+    order, shares = np.argsort(lengths, kind="stable"), np.empty((len(lengths), 4, 15, 15))
+    while len(order):  # the longest ones first
+        count = min(max(_AT_ONCE // max(int(lengths[order[-1]]), 1), 1), len(order))
+        rows, order = order[-count:], order[:-count]
+        parts = ([values[k] for k in rows] for values in (durations_s, gyro, accel))
+        shares[rows] = _shares(*_padded(*parts))
+    return shares
+
+
+def _shares(dt: FloatArray, rates: FloatArray, forces: FloatArray) -> FloatArray:
+    """`noise_shares` of intervals with the same number of steps, see `_padded`."""
     count, steps = dt.shape
     turns, halves = _exp(rates * dt[:, :, None]), _exp(rates * (0.5 * dt)[:, :, None])
     R = np.empty((count, steps + 1, 3, 3))

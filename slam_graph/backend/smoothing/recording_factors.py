@@ -189,8 +189,9 @@ class RecordingFactors:
     ) -> gtsam.NonlinearFactorGraph:
         """The factors under the noise that was learned since they were made.
 
-        Samples stay preintegrated at the same biases, unless the noise has become so much smaller
-        that it would be a small difference of large numbers.
+        Samples stay preintegrated at the same biases, and priors about the same values, unless the
+        noise has become so much smaller that it would be a small difference of large numbers: then
+        both are made anew.
 
         Args:
             inertial: what `inertial`, or this, gave last.
