@@ -19,7 +19,6 @@ from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import DataError
 from slam_graph.frontend.frontend_config import DESCRIPTORS, FRONTENDS, FrontendConfig
 from slam_graph.geometry import NavState
-from slam_graph.kernels.ascending import are_among
 from slam_graph.sensors import CameraFrame, FeatureFrame, ImuData, Rig
 
 STANDARD_GRAVITY = 9.81
@@ -194,14 +193,12 @@ class _ReplayFrontend:
                 f"frame {frame.stamp_ns} has features of {len(frame.cameras)} cameras, the rig has "
                 f"{self._cameras}"
             )
-        ids = frame.ids
-        dropped = are_among(ids, self._dropped)
-        known = are_among(ids[~dropped], self._seen)
-        tracked, kept = np.count_nonzero(known), len(known)
+        ids = np.unique(np.concatenate([c.ids for c in frame.cameras]))
+        dropped = np.isin(ids, self._dropped)
         self.frame_stats = {
-            "tracked": float(tracked),
-            "new": float(kept - tracked),
-            "dropped": float(len(ids) - kept),
+            "tracked": float(np.count_nonzero(np.isin(ids[~dropped], self._seen))),
+            "new": float(np.count_nonzero(~np.isin(ids[~dropped], self._seen))),
+            "dropped": float(np.count_nonzero(dropped)),
         }
         self._seen = ids
         static = frame.without(self._dropped) if dropped.any() else frame

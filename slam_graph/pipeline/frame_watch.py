@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam_graph.diagnostics import Diagnostics
-from slam_graph.kernels.ascending import are_among
 from slam_graph.sensors import CameraFrame, FeatureFrame, FeatureObservations, Rig
 
 _GAP_PERIODS = 2.5
@@ -68,7 +67,7 @@ class FrameWatch:
 
     def _look_at_tracks(self, before: FeatureFrame, frame: FeatureFrame) -> None:
         for name, seen, now in zip(self._names, before.cameras, frame.cameras, strict=False):
-            followed = int(np.count_nonzero(are_among(seen.ids, np.sort(now.ids))))
+            followed = int(np.count_nonzero(np.isin(seen.ids, now.ids)))
             if _repeated(seen, now):
                 self._warn_of_repeat(f"{name} gives the features", frame.stamp_ns)
             elif followed < min(_FEW_FEATURES, _FEW_SHARE * len(seen)):
