@@ -6,9 +6,10 @@ A run with a wrong calibration may come to its end, with errors that nothing in 
 run is followed by a quick diagnosis of the tracks after its start, and one that failed, was not
 smooth, or contradicts that, by a full one. If that finds a fault in what the run was given, the run
 is `suspect`, whatever it has estimated. A run that does not start is diagnosed while it waits, and
-one that goes on 6 and 24 s after its start, and after 12 s where 6 s were too little to tell. After
-24 s all frames are there that a diagnosis takes.
-The time offset between camera and IMU is watched over the whole run, as it may change later on.
+one that goes on 6 and 24 s after its start, after 12 s where 6 s did not rule out what would ruin
+it, and at once where its start had to be corrected. After 24 s all frames are there that a
+diagnosis takes. The time offset between camera and IMU is watched over the whole run, as it may
+change later on.
 """
 
 from __future__ import annotations
@@ -95,8 +96,8 @@ class Verdict(Stage):
         objects = objects or NoObjects()
         self._estimates_objects = type(objects) is not NoObjects
         rig = result.input.rig
-        self._cameras = len(rig.cameras)
-        self._kept = KeptFrames(self._cameras > 1, objects)
+        self._has_pairs = len(rig.cameras) > 1
+        self._kept = KeptFrames(self._has_pairs, objects)
         self._clocks = ClockWatch(result, objects, diagnostics) if rig.has_imu else None
         self._estimated = self._at_limit = 0  # frames with a state; noise of the IMU at its limit
         self._diagnosis: Diagnosis | None = None  # a quick one of all that is kept
@@ -243,8 +244,10 @@ class Verdict(Stage):
             return
         found = self._quick_diagnosis()
         self._refuse_if_ruined(found)
-        limits = {kind: _RUINING[kind] for kind in ("focal_length", "baseline")[: self._cameras]}
-        clear = found is not None and found.rules_out(limits | {"mounting": _RUINING_DEG})
+        limits = {"mounting": _RUINING_DEG, "focal_length": _RUINING["focal_length"]}
+        if self._has_pairs:
+            limits["baseline"] = _RUINING["baseline"]
+        clear = found is not None and found.rules_out(limits)
         self._early_checks_ns = () if clear else self._early_checks_ns[1:]
 
     def _watch_full(self) -> None:

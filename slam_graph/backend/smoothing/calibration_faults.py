@@ -13,8 +13,8 @@ from slam_graph.arrays import FloatArray
 from slam_graph.sensors import CalibrationEstimate
 
 _SIGMAS, _SIGMAS_BASELINE = 6.0, 4.5
-"""A difference counts from so many standard deviations on. That of a baseline is a single number,
-which no error of the world or the body is mixed with."""
+"""A difference counts from so many standard deviations on. A baseline is a single number, which
+is known better than the places of the cameras in the body."""
 _TURN_RAD, _MOVE_M = np.deg2rad(0.2), 0.015
 _FOCAL, _CENTRE_PX = 0.005, 3.0
 _DISTORTION_PX = 1.0
