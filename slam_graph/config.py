@@ -80,10 +80,10 @@ class LimitsConfig(Settings):
     """Whether a run is ended whose calibration or units are certainly wrong, as a diagnosis finds.
     One that waits for its first state, or for another one before a segment has lasted for five
     seconds, is diagnosed after 5 s of the recording, again after 10, 20, … s, and at once after a
-    loss. One whose estimate has lasted is diagnosed 6 and 24 s after its start (after 12 s as well
-    where 6 s did not rule that out), at once where its start had to be corrected, and while it
-    waits after a loss, and is ended only if calibration or units are so wrong that the estimate is
-    worth nothing. Without it, or without
+    loss. One whose estimate has lasted is diagnosed 24 s after its start, from 6 s on where images
+    contradict the IMU (after 12 s as well where the first diagnosis did not rule that out), at once
+    where its start had to be corrected, and while it waits after a loss, and is ended only if
+    calibration or units are so wrong that the estimate is worth nothing. Without it, or without
     `backend.initialization.check_calibration`, the cause is looked for at the end."""
 
     max_speed: float = expert(default=100.0, gt=0)

@@ -104,7 +104,7 @@ def test_a_right_calibration_is_found_to_be_right() -> None:
     [
         ("turned", "cam0 is turned by"),
         slow("longer", "the focal lengths of cam0"),
-        ("bent", "the distortion of cam0"),
+        slow("bent", "the distortion of cam0"),
         ("late", "the time offset of the cameras is 6."),
     ],
 )
@@ -159,6 +159,7 @@ def test_cameras_at_one_place_have_no_baseline() -> None:
     assert "cam1 is turned by 5.73°" in fault.what
 
 
+@pytest.mark.slow
 def test_a_small_offset_that_is_found_late_loses_nothing() -> None:
     result, truth = adjusted("late", rate_hz=20.0), flight(20.0).groundtruth()
     assert result.warnings["calibration_corrected"] == 1
@@ -167,6 +168,7 @@ def test_a_small_offset_that_is_found_late_loses_nothing() -> None:
     assert ape(truth, result.trajectory, alignment="yaw").statistics.rmse < 0.03
 
 
+@pytest.mark.slow
 def test_beside_moving_objects_the_calibration_of_the_run_is_kept() -> None:
     found = adjusted("turned", "objects.enabled=true").final_ba
     assert found is not None

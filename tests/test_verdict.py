@@ -23,7 +23,7 @@ from slam_graph.datasets.memory_sequence import dataset_from_arrays
 from slam_graph.datasets.sequence import RecordedSequence
 from slam_graph.diagnosis import Diagnosis, run_evidence
 from slam_graph.diagnostics import Diagnostics
-from slam_graph.pipeline import clock_watch, recovery, verdict
+from slam_graph.pipeline import clock_watch, recovery, run_doubts, verdict
 from slam_graph.pipeline.run_recording import run
 from slam_graph.pipeline.stage import EstimatedFrame
 from slam_graph.sensors.measurements import FeatureFrame, FeatureObservations
@@ -144,7 +144,7 @@ def test_a_wrong_calibration_is_suspect(
 def test_a_right_one_is_not_even_if_it_is_doubted(
     trajectory: str, seed: int, cameras: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(verdict, "_MAX_REJECTED", -1.0)  # every run is diagnosed
+    monkeypatch.setattr(run_doubts, "_MAX_REJECTED", -1.0)  # every run is diagnosed
     sequence = simulate(
         trajectory=trajectory, cameras=cameras, duration_s=10.0, rate_hz=RATE_HZ, seed=seed
     )
@@ -269,6 +269,20 @@ def test_a_wrong_setup_that_starts_is_refused_where_its_estimate_is_lost(fault: 
     assert result.logs.frames / RATE_HZ < 11.0
 
 
+def test_a_good_run_is_diagnosed_at_its_end_only(monkeypatch: pytest.MonkeyPatch) -> None:
+    after, nearby = list[int](), verdict.Verdict._nearby
+
+    def counted(judged: verdict.Verdict, rig: Rig) -> Diagnosis:
+        after.append(judged._result.logs.frames)
+        return nearby(judged, rig)
+
+    monkeypatch.setattr(verdict.Verdict, "_nearby", counted)
+    sequence = simulate(trajectory="figure8", cameras=2, duration_s=8.0, rate_hz=RATE_HZ, seed=2)
+    result = run(sequence, overrides=CAUSAL)
+    assert result.status == "ok", result.message
+    assert after == [result.logs.frames]
+
+
 def test_a_wrong_setup_is_refused_six_seconds_after_its_start_where_that_is_enough() -> None:
     sequence = simulate(trajectory="figure8", cameras=2, duration_s=14.0, rate_hz=RATE_HZ, seed=1)
     result = run(seen_by(sequence, with_double_baseline(sequence.rig)), overrides=CAUSAL)
@@ -344,7 +358,7 @@ def test_faults_that_leave_little_to_compare_make_no_calibration_wrong(
     duration_s: float, faults: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A standstill and seconds of motion: other mountings and axes fit, the given ones too."""
-    monkeypatch.setattr(verdict, "_MAX_REJECTED", -1.0)  # every run is diagnosed
+    monkeypatch.setattr(run_doubts, "_MAX_REJECTED", -1.0)  # every run is diagnosed
     recording = open_dataset("demo", faults=faults)
     result = run(recording, overrides=CAUSAL, duration_s=duration_s)
     assert result.status in ("ok", "low_coverage"), result.message  # a take-off without IMU

@@ -8,8 +8,9 @@ smooth, or contradicts that, by a full one. If that finds a fault in what the ru
 is `suspect`, whatever it has estimated. A run that does not start is diagnosed while it waits, and
 one that goes on 6 and 24 s after its start, after 12 s where 6 s did not rule out what would ruin
 it, and at once where its start had to be corrected. After 24 s all frames are there that a
-diagnosis takes. The time offset between camera and IMU is watched over the whole run, as it may
-change later on.
+diagnosis takes. Before that an estimate whose images agree with its IMU as in good runs is not
+diagnosed. The time offset between camera and IMU is watched over the whole run, as it may change
+later on.
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import DataError, EstimationError
 from slam_graph.pipeline.clock_watch import ClockWatch
 from slam_graph.pipeline.kept_frames import KEPT_NS, KeptFrames
+from slam_graph.pipeline.run_doubts import RunDoubts
 from slam_graph.pipeline.stage import COMPLETED, EstimatedFrame, NoObjects, Stage, warn_on_failure
 from slam_graph.results import RunResult
 from slam_graph.sensors import FeatureFrame, ImuData, Rig
@@ -46,16 +48,12 @@ _RUINING = _HINDERING | {"focal_length": 0.2}
 _RUINING_DEG = 6.0
 """The same for the error of a camera's mounting, in degrees."""
 _FAILED = ("not_initialized", "diverged", "low_coverage")
-_DOUBTS = ("start_corrected", "new_segment", "scale_unknown")
-"""Warnings after which an estimate that came to its end is doubted."""
-_MAX_REJECTED = 0.05
-"""The same for the share of features that the gate rejects. Of good recordings it is 2 to 4 %."""
 _WORLD_NOT_CLEAR = (
     "something that moves covers so much of the images that it may have been taken for the world"
 )
 _FEWEST_SHARED = 0.25
-"""The same for the share of features that the second camera sees, where it sees any: half of them
-and more where cameras are mounted side by side."""
+"""An estimate is doubted where the second camera sees a smaller share of the features, if it sees
+any: half of them and more where cameras are mounted side by side."""
 
 logger = logging.getLogger(__name__)
 
@@ -99,7 +97,7 @@ class Verdict(Stage):
         self._has_pairs = len(rig.cameras) > 1
         self._kept = KeptFrames(self._has_pairs, objects)
         self._clocks = ClockWatch(result, objects, diagnostics) if rig.has_imu else None
-        self._estimated = self._at_limit = 0  # frames with a state; noise of the IMU at its limit
+        self._doubts = RunDoubts(result, diagnostics)
         self._diagnosis: Diagnosis | None = None  # a quick one of all that is kept
         self._diagnosis_failed = False
         self._corrected = 0  # starts that were solved again so far
@@ -122,13 +120,12 @@ class Verdict(Stage):
         if self._clocks is not None:
             self._clocks.add(frame)
         if frame.restarted:
-            self._estimated = self._at_limit = 0
+            self._doubts.forget()
             self._diagnosis, self._diagnosis_failed = None, False
             corrected = self._diagnostics.counts["start_corrected"]
             self._early_checks_ns = (0,) * (corrected > self._corrected) + _EARLY_CHECKS_NS
             self._corrected = corrected
-        self._estimated += frame.initialized
-        self._at_limit += frame.initialized and frame.imu_noise_at_limit
+        self._doubts.add(frame)
         if frame.restarted or not frame.initialized:
             self._started_ns = None
         elif self._started_ns is None:
@@ -180,7 +177,7 @@ class Verdict(Stage):
         adjusted = result.final_ba if measured and not result.georeferenced else None
         found = Diagnosis.of_run(
             innovations,
-            self._at_limit / self._estimated if measured and self._estimated else None,
+            self._doubts.noise_at_limit,
             result.history,
             None if adjusted is None else adjusted.history,
         )
@@ -242,13 +239,16 @@ class Verdict(Stage):
         """
         if not self._refuses or not self._early_checks_ns or lasted_ns <= self._early_checks_ns[0]:
             return
+        if self._early_checks_ns[0] and self._doubts.imu_agrees:
+            return
         found = self._quick_diagnosis()
         self._refuse_if_ruined(found)
         limits = {"mounting": _RUINING_DEG, "focal_length": _RUINING["focal_length"]}
         if self._has_pairs:
             limits["baseline"] = _RUINING["baseline"]
         clear = found is not None and found.rules_out(limits)
-        self._early_checks_ns = () if clear else self._early_checks_ns[1:]
+        later = (ns for ns in self._early_checks_ns if ns >= lasted_ns)
+        self._early_checks_ns = () if clear else tuple(later)
 
     def _watch_full(self) -> None:
         """Ask whether the estimate is worth anything, once all frames for a diagnosis are there.
@@ -377,9 +377,7 @@ class Verdict(Stage):
 
     def _is_doubtful(self) -> bool:
         """Whether something shows that a good recording hardly ever shows."""
-        counts, tested = self._diagnostics.counts, self._result.logs.innovations.columns()
-        rejected = float(tested["rejected"].sum()) / max(float(tested["tested"].sum()), 1.0)
-        if rejected > _MAX_REJECTED or any(counts[kind] for kind in _DOUBTS):
+        if self._doubts.exist:
             return True
         kept = self._kept
         if kept.pairs and kept.shared < _FEWEST_SHARED:

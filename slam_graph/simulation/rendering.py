@@ -14,7 +14,8 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from slam_graph.arrays import FloatArray
+from slam_graph.arrays import FloatArray, IntArray
+from slam_graph.kernels.wall_rendering import cast_rays
 from slam_graph.sensors import CameraFrame, Rig, RigCamera
 from slam_graph.simulation.depth_rendering import DepthRendering
 from slam_graph.simulation.landmarks import MovingBoard
@@ -24,7 +25,7 @@ from slam_graph.simulation.simulation_config import ImageConfig, random_stream
 from slam_graph.simulation.textures import Atlas, Grey
 from slam_graph.simulation.world import Panel, World
 
-_NEAREST_M = 1e-3
+_NEAREST_M, _FARTHEST_M = 1e-3, 1e6
 _LIGHT = np.array([0.25, 0.45, 0.86])
 """Direction of the light: walls of different orientation differ in brightness."""
 
@@ -245,11 +246,10 @@ class _Hits:
     """
 
     def __init__(self, count: int) -> None:
-        self.panel = np.zeros(count, np.intp)
-        self.distance = np.full(count, np.float32(1e6))
-        self.slant: Grey = np.ones(count, np.float32)
-        self.a: Grey = np.zeros(count, np.float32)
-        self.b: Grey = np.zeros(count, np.float32)
+        self.panel: IntArray = np.zeros(count, np.int64)
+        self.places: Grey = np.zeros((4, count), np.float32)
+        self.distance, self.slant, self.a, self.b = self.places
+        self.distance[:], self.slant[:] = _FARTHEST_M, 1.0
 
 
 def cast(world: World, eye: FloatArray, rays: Grey) -> _Hits:
@@ -261,23 +261,13 @@ def cast(world: World, eye: FloatArray, rays: Grey) -> _Hits:
         rays: (N, 3) unit vectors.
     """
     hits = _Hits(len(rays))
-    for index, panel in enumerate(world.panels):
-        away = panel.corner - eye
-        height = float(away @ panel.normal)
-        if height >= -_NEAREST_M:
-            continue
-        frame = np.stack([panel.normal, panel.across, panel.along]).astype(np.float32)
-        slope, across, along = frame @ rays.T
-        with np.errstate(divide="ignore"):
-            distance = np.float32(height) / slope
-        near = np.flatnonzero((distance > 0) & (distance < hits.distance))
-        t = distance[near]
-        a = t * across[near] - np.float32(away @ panel.across)
-        b = t * along[near] - np.float32(away @ panel.along)
-        inside = (a >= 0) & (a <= panel.size[0]) & (b >= 0) & (b <= panel.size[1])
-        near, t, a, b = near[inside], t[inside], a[inside], b[inside]
-        hits.panel[near], hits.distance[near], hits.slant[near] = index, t, -slope[near]
-        hits.a[near], hits.b[near] = a, b
+    frames = np.array([[panel.normal, panel.across, panel.along] for panel in world.panels])
+    corners = np.array([panel.corner - eye for panel in world.panels])
+    sizes = np.array([panel.size for panel in world.panels])
+    places = np.column_stack([(frames @ corners[:, :, None])[:, :, 0], sizes])
+    ahead = np.flatnonzero(places[:, 0] < -_NEAREST_M)
+    seen = frames[ahead].astype(np.float32), places[ahead].astype(np.float32)
+    cast_rays(np.ascontiguousarray(rays), ahead, *seen, hits.panel, hits.places)
     return hits
 
 

@@ -11,6 +11,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from slam_graph.arrays import IntArray
+from slam_graph.kernels.wall_rendering import sample_textures
 from slam_graph.simulation.simulation_config import random_stream
 
 Grey = NDArray[np.float32]
@@ -46,8 +48,8 @@ class Atlas:
     heights: NDArray[np.int64]
     texels_m: Grey
 
-    def sample(self, panel: NDArray[np.intp], footprint: Grey, a: Grey, b: Grey) -> Grey:
-        """Grey values (N,), interpolated linearly between texels and between levels (trilinear).
+    def sample(self, panel: IntArray, footprint: Grey, a: Grey, b: Grey) -> Grey:
+        """Grey values (N,), interpolated between texels and between levels.
 
         Args:
             panel: (N,) numbers of the panels.
@@ -55,37 +57,13 @@ class Atlas:
             a: (N,) coordinates on the panel, across, m.
             b: (N,) along, m.
         """
-        texel_m = self.texels_m[panel]
-        level = np.clip(np.log2(footprint / texel_m), 0.0, LEVELS - 1.001)
-        fine = level.astype(np.intp)
-        x, y = a / texel_m - 0.5, b / texel_m - 0.5
-        lower = self._within(panel * LEVELS + fine, fine, x, y)
-        upper = self._within(panel * LEVELS + fine + 1, fine + 1, x, y)
-        mixed: Grey = lower + (level - fine).astype(np.float32) * (upper - lower)
-        return mixed
-
-    def _within(self, row: NDArray[np.intp], level: NDArray[np.intp], x: Grey, y: Grey) -> Grey:
-        """Grey values (N,) of single levels, at coordinates in texels of the finest level.
-
-        The centre of texel i of a level is that of texel i · 2^level of the finest level, because
-        `cv2.pyrDown` keeps every other texel.
-        """
-        scale = np.ldexp(np.float32(1.0), -level)
-        width = self.widths[row]
-        x = np.clip(x * scale, 0, (width - 1.001).astype(np.float32))
-        y = np.clip(y * scale, 0, (self.heights[row] - 1.001).astype(np.float32))
-        column, line = x.astype(np.int64), y.astype(np.int64)
-        u, v = x - column.astype(np.float32), y - line.astype(np.float32)
-        place = self.offsets[row] + line * width + column
-        top = _mix(self.texels[place], self.texels[place + 1], u)
-        place += width
-        return _mix(top, _mix(self.texels[place], self.texels[place + 1], u), v)
-
-
-def _mix(a: NDArray[np.uint8] | Grey, b: NDArray[np.uint8] | Grey, weight: Grey) -> Grey:
-    start = a.astype(np.float32)
-    mixed: Grey = start + weight * (b.astype(np.float32) - start)
-    return mixed
+        grey = np.empty(len(panel), np.float32)
+        offsets, widths, heights = (
+            table.reshape(-1, LEVELS) for table in (self.offsets, self.widths, self.heights)
+        )
+        levels = self.texels, offsets, widths, heights, self.texels_m
+        sample_textures(*levels, panel, footprint, a, b, grey)
+        return grey
 
 
 def paint(sizes: Sequence[tuple[float, float]], texels_m: Sequence[float], seed: int) -> Atlas:
@@ -101,13 +79,13 @@ def paint(sizes: Sequence[tuple[float, float]], texels_m: Sequence[float], seed:
         rng = np.random.default_rng(random_stream(seed, "texture", index))
         width, height = (max(round(side / texel_m), 2) for side in size)
         images += _pyramid(_noise(width, height, texel_m, rng))
-    shapes = np.array([image.shape for image in images], np.int64)
-    ends = np.cumsum(shapes[:, 0] * shapes[:, 1])
+    heights, widths = np.array([image.shape for image in images], np.int64).T.copy()
+    ends = np.cumsum(heights * widths)
     return Atlas(
         texels=np.concatenate([image.ravel() for image in images]),
         offsets=np.concatenate([[0], ends[:-1]]),
-        widths=shapes[:, 1],
-        heights=shapes[:, 0],
+        widths=widths,
+        heights=heights,
         texels_m=np.array(texels_m, np.float32),
     )
 

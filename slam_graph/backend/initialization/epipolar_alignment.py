@@ -124,6 +124,9 @@ class _Problem:
         self._variances = np.maximum(np.concatenate(sigmas), _LEAST_SIGMA_RAD) ** 2
         self._sizes = np.array([len(i) for _, _, i, _ in pairs])
         self._begins = np.append(0, np.cumsum(self._sizes)).astype(np.int64)
+        rows = self._begins[:-1, None] + np.arange(self._sizes.max())
+        # (P, M) rows of each pair; behind them the number of all rows
+        self._rows = np.where(rows < self._begins[1:, None], rows, self._begins[-1])
         self._gyro = IntegratedGyroscope(imu)
         stamps = np.array([[frames[a][0] for a, *_ in pairs], [frames[b][0] for _, b, *_ in pairs]])
         self._t = 1e-9 * (stamps - self._gyro.start_ns)
@@ -202,8 +205,10 @@ class _Problem:
         )
         variance = np.maximum(np.sum(self._variances * sines, axis=1), _TINY**2)
         squares = np.sum(normals * t, axis=1) ** 2 / (CAUCHY_WIDTH**2 * variance)
-        parts = np.split(squares, self._begins[1:-1])
-        units = [max(1.0, float(median(p)) * CAUCHY_WIDTH**2 / _MEDIAN_CHI2_1) for p in parts]
+        ascending = np.sort(np.append(squares, np.inf).take(self._rows), axis=1)
+        middle = np.stack([(self._sizes - 1) // 2, self._sizes // 2], axis=1)
+        medians = np.mean(np.take_along_axis(ascending, middle, axis=1), axis=1)
+        units = np.maximum(1.0, medians * CAUCHY_WIDTH**2 / _MEDIAN_CHI2_1)
         return np.asarray(1.0 / ((1.0 + squares / np.repeat(units, self._sizes)) * variance))
 
     def minimized(

@@ -46,7 +46,8 @@ _RESTS_RAD_S = 0.05
 """The platform turns too little for an estimate by epipolar errors where the standard deviation of
 the angular rate is below this."""
 _RETRY_NS, _LATER_RETRY_NS = 400_000_000, 900_000_000
-"""Time between two estimates at the start, and between two tests of the clock later."""
+"""Time between two estimates at the start, and later: between those after one that is near to the
+calibration, and between two tests of the clock."""
 _LATER_PAUSE_NS, _LONGEST_PAUSE_NS = 5_000_000_000, 60_000_000_000
 """Time after an estimate that shows nothing, and after many of them: each takes 0.1 s."""
 _WAIT_NS = 5_000_000_000
@@ -159,7 +160,8 @@ class StartCalibration:
         self._turns.add(frame, imu, self.mounted, _SPACING_NS)
         if self._waits(frame):
             return None
-        self._next_ns = frame.stamp_ns + _RETRY_NS
+        near = started and self._is_within(_NEAR_S)
+        self._next_ns = frame.stamp_ns + (_LATER_RETRY_NS if near else _RETRY_NS)
         covered = self._turns.covered(imu)
         self.done = self._turns.seen > _GIVE_UP_TURNS and self.mounted and started
         if covered is None:
@@ -234,11 +236,17 @@ class StartCalibration:
         agrees = clear is None or self._distance_s(clear, -_FITS_SIGMAS) < 0.0
         agrees |= clear is not None and self._distance_s(clear, 0.0) < _ADOPTED_S
         if self.mounted and started and agrees and last is not None and last.is_clear():
-            distance_s = self._distance_s(last, _NEAR_SIGMAS)
-            if distance_s < _SETTLED_S:
+            if self._is_within(_SETTLED_S):
                 return True
-            pause_ns = _SELDOM_NS if distance_s < _NEAR_S else pause_ns
+            pause_ns = _SELDOM_NS if self._is_within(_NEAR_S) else pause_ns
         return frame.stamp_ns < self._refined_ns + pause_ns
+
+    def _is_within(self, distance_s: float) -> bool:
+        """Whether the last estimate by epipolar errors is so near to the calibration."""
+        last = self._last
+        if last is None or not (self.mounted and last.is_clear()):
+            return False
+        return self._distance_s(last, _NEAR_SIGMAS) < distance_s
 
     def _distance_s(self, found: GyroAlignment, sigmas: float) -> float:
         """How far the calibrated offset is from an estimate and some of its deviations."""
