@@ -10,13 +10,14 @@ are those of the camera model, so distortion is exact. Textures are interpolated
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
-from slam_graph.arrays import FloatArray, IntArray
+from slam_graph.arrays import BoolArray, FloatArray, IntArray
 from slam_graph.kernels.wall_rendering import cast_rays
-from slam_graph.sensors import CameraFrame, Rig, RigCamera
+from slam_graph.sensors import Camera, CameraFrame, Rig, RigCamera
 from slam_graph.simulation.depth_rendering import DepthRendering
 from slam_graph.simulation.landmarks import MovingBoard
 from slam_graph.simulation.motion import Motion
@@ -220,19 +221,29 @@ class _RayCamera:
         camera, pose = mounted.camera, mounted.body_T_camera
         self.mounted = mounted
         self.width, self.height = camera.width, camera.height
-        u, v = np.meshgrid(np.arange(self.width), np.arange(self.height))
-        pixels = np.column_stack([u.ravel(), v.ravel()]).astype(np.float64)
-        plane, self.lit = camera.visible(pixels)
-        rays = np.column_stack([plane, np.ones(len(plane))])
-        rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-        self.rays = rays.astype(np.float32)
+        self.rays, self.stretch, self.lit = _pixels_of(camera)
         self.focal_px = np.float32(0.5 * (camera.fx + camera.fy))
-        grid = rays.reshape(self.height, self.width, 3)
-        sides = [np.linalg.norm(np.gradient(grid, axis=axis), axis=2) for axis in (0, 1)]
-        stretch = (np.sqrt(sides[0] * sides[1]) * self.focal_px).ravel().astype(np.float32)
-        self.stretch = np.maximum(stretch, np.float32(1e-3))  # it is 0 outside the field of view
         self.body_R_camera = pose.rotation().matrix()
         self.position = np.asarray(pose.translation())
+
+
+@lru_cache(maxsize=2)
+def _pixels_of(camera: Camera) -> tuple[Grey, Grey, BoolArray]:
+    """Rays, stretch and field of view of a camera, as `_RayCamera` has them.
+
+    Those of the last two are kept, for the next simulation: it takes 0.2 s to invert a lens.
+    """
+    u, v = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
+    pixels = np.column_stack([u.ravel(), v.ravel()]).astype(np.float64)
+    plane, lit = camera.visible(pixels)
+    rays = np.column_stack([plane, np.ones(len(plane))])
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    grid = rays.reshape(camera.height, camera.width, 3)
+    sides = [np.linalg.norm(np.gradient(grid, axis=axis), axis=2) for axis in (0, 1)]
+    focal_px = np.float32(0.5 * (camera.fx + camera.fy))
+    stretch = (np.sqrt(sides[0] * sides[1]) * focal_px).ravel().astype(np.float32)
+    # it is 0 outside the field of view
+    return rays.astype(np.float32), np.maximum(stretch, np.float32(1e-3)), lit
 
 
 class _Hits:
