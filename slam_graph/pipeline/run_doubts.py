@@ -66,6 +66,4 @@ class RunDoubts:
 
     @property
     def _rejects_much(self) -> bool:
-        tested = self._result.logs.innovations.columns()
-        rejected = float(tested["rejected"].sum()) / max(float(tested["tested"].sum()), 1.0)
-        return rejected > _MAX_REJECTED
+        return self._result.logs.innovations.rejected_share > _MAX_REJECTED

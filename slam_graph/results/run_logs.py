@@ -86,6 +86,7 @@ class InnovationLog:
         self._stamps_ns = array("q")
         self._counts = GrowingTable(len(_COUNTS), np.int32)
         self._sums = GrowingTable(len(_SUMS), np.float32)
+        self._tested = self._rejected = 0
 
     def __len__(self) -> int:
         return len(self._stamps_ns)
@@ -96,6 +97,8 @@ class InnovationLog:
             self._stamps_ns.append(stamp_ns)
             self._counts.append(_counts_of(innovations))
             self._sums.append(_sums_of(innovations))
+            self._tested += innovations.tested
+            self._rejected += innovations.rejected
 
     def forget_from(self, stamp_ns: int) -> None:
         """Forget the frames at and after a time."""
@@ -103,6 +106,13 @@ class InnovationLog:
         del self._stamps_ns[kept:]
         self._counts.cut(kept)
         self._sums.cut(kept)
+        columns = self.columns()
+        self._tested, self._rejected = (int(columns[k].sum()) for k in ("tested", "rejected"))
+
+    @property
+    def rejected_share(self) -> float:
+        """Rejected features as a part of those that were tested; 0 if none was."""
+        return self._rejected / max(self._tested, 1)
 
     @property
     def stamps_ns(self) -> IntArray:
