@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
+from weakref import WeakSet
 
 import gtsam
 import numpy as np
@@ -21,9 +22,11 @@ from slam_graph.backend.smoothing.causal_outliers import causal_outliers
 from slam_graph.backend.smoothing.final_adjustment import FinalBa, adjust_recording, segments
 from slam_graph.backend.smoothing.frame_log import FrameLog
 from slam_graph.backend.smoothing.keyframe_states import state_at
+from slam_graph.backend.smoothing.learned_imu_noise import _LinearImages
 from slam_graph.backend.smoothing.recording_factors import nearest_keyframe
 from slam_graph.backend.smoothing.smoothing_config import FinalBaConfig
 from slam_graph.backend.smoothing.smoothing_task import SmoothingTask
+from slam_graph.backend.smoothing.state_elimination import ChainEquations, EliminatedStates
 from slam_graph.config import load_config
 from slam_graph.datasets.calibration.kalibr_calibration import write_kalibr
 from slam_graph.datasets.dataset_registry import open_dataset
@@ -171,6 +174,29 @@ def test_segments_join_to_one_trajectory(keep: Keep) -> None:
     assert worst_m(whole.trajectory, cut.trajectory) < 0.0135
     assert [step[2] for step in steps] == list(range(1, cut.summary.iterations + 1))
     assert worst_m(kept.truth, whole.trajectory) < 0.0215
+
+
+def test_there_is_one_factor_of_all_states_at_a_time(
+    keep: Keep, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A segment of 600 keyframes has 120 MB of them, and as much of what images say."""
+    living: WeakSet[EliminatedStates] = WeakSet()
+    make, begin, numbers = _LinearImages.factor, EliminatedStates.__init__, list[int]()
+
+    def made(self: _LinearImages, chain: ChainEquations) -> EliminatedStates:
+        numbers.append(len(living))
+        return make(self, chain)
+
+    def begun(self: EliminatedStates, *given: Any) -> None:
+        living.add(self)
+        begin(self, *given)
+
+    monkeypatch.setattr(_LinearImages, "factor", made)
+    monkeypatch.setattr(EliminatedStates, "__init__", begun)
+    kept = keep(flight(sigma=1.0))
+    kept.adjusted(disturbed(kept.truth))
+    assert numbers
+    assert not any(numbers)
 
 
 @pytest.mark.parametrize("keyframes", [3, 20, 21, 57, 100])

@@ -6,6 +6,7 @@ import csv
 import io
 import json
 import logging
+import pickle
 from datetime import UTC, datetime
 from pathlib import Path
 from types import SimpleNamespace
@@ -207,6 +208,12 @@ def test_growing_table_is_what_one_array_would_be() -> None:
         assert np.array_equal(table.rows(), expected)
         table.cut(1030)
         table.extend(rows[1030:])
+
+
+def test_stamps_in_a_growing_table_take_a_fraction_of_their_bytes() -> None:
+    table = GrowingTable(1, np.int64)
+    table.extend(np.arange(0, 10**12, 10**7)[:, None])
+    assert len(pickle.dumps(table)) < 0.25 * table.rows().nbytes
 
 
 def test_laps_of_a_stopwatch_add_up() -> None:

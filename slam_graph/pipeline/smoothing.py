@@ -14,6 +14,7 @@ from slam_graph import backend
 from slam_graph.arrays import FloatArray
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import EstimationError, SlamGraphError
+from slam_graph.free_memory import give_back
 from slam_graph.pipeline.observers import Progress
 from slam_graph.pipeline.stage import (
     COMPLETED,
@@ -99,7 +100,7 @@ class Smoothing(Stage):
             return
         with warn_on_failure(self._diagnostics, "final_ba_failed", _FAILED):
             self._recording.close()
-            self._result.give_back_memory()  # the adjustment takes tens of MB
+            give_back()  # the adjustment takes tens of MB
             self._solve(self._log)
 
     def _solve(self, log: backend.FrameLog) -> None:

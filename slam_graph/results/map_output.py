@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from slam_graph import maps
-from slam_graph.arrays import FloatArray, IntArray
+from slam_graph.arrays import FloatArray, GrowingTable, IntArray
 from slam_graph.errors import DataError
 from slam_graph.files import Files
 from slam_graph.results.result_files import find_map, refuse_to_replace
@@ -25,19 +25,19 @@ _CAMERA_COLOUR = (220, 30, 30)
 _POSITION_PROPERTIES = tuple(f"property double {axis}" for axis in "xyz")
 
 RECENT = 10_000
-"""Features are moved from the dictionary into the arrays when there are more than this."""
+"""Features are moved from the dictionary into the tables when there are more than this."""
 _REMEMBERED_NS = 30_000_000_000
 """So long it is known which features were estimated when: states are taken back sooner."""
 
 
 class PointMap:
-    """The last estimate of every feature; 32 bytes for each but the recent ones."""
+    """The last estimate of every feature; some 24 bytes for each but the recent ones."""
 
     def __init__(self) -> None:
         self._updates: deque[tuple[int, IntArray]] = deque()
         self._recent: dict[int, tuple[float, float, float]] = {}
-        self._ids = np.zeros(0, np.int64)
-        self._points = np.zeros((0, 3))
+        self._ids = GrowingTable(1, np.int64)
+        self._points = GrowingTable(3)
 
     def __len__(self) -> int:
         self._pack()
@@ -64,22 +64,34 @@ class PointMap:
         gone = [np.zeros(0, np.int64)]
         while self._updates and self._updates[-1][0] >= stamp_ns:
             gone.append(self._updates.pop()[1])
-        kept = ~np.isin(self._ids, np.concatenate(gone))
-        self._ids, self._points = self._ids[kept], self._points[kept]
+        self._drop(np.concatenate(gone))
 
     def points(self) -> FloatArray:
         """(N, 3) in the world, m."""
         self._pack()
-        return self._points
+        return self._points.rows()
 
     def _pack(self) -> None:
-        """Move the recent features into the arrays; older positions of the same ids are dropped."""
+        """Move the recent features into the tables; older positions of the same ids are dropped."""
+        if not self._recent:
+            return
         ids = np.array(list(self._recent), dtype=np.int64)
         points = np.array(list(self._recent.values()), dtype=np.float64).reshape(-1, 3)
-        kept = ~np.isin(self._ids, ids)
-        self._ids = np.concatenate([self._ids[kept], ids])
-        self._points = np.concatenate([self._points[kept], points])
+        self._drop(ids)
+        self._ids.extend(ids[:, None])
+        self._points.extend(points)
         self._recent = {}
+
+    def _drop(self, ids: IntArray) -> None:
+        """Drop features (N,); they are mostly among the last ones."""
+        dropped = np.isin(self._ids.rows()[:, 0], ids)
+        if not dropped.any():
+            return
+        first = int(dropped.argmax())
+        for table in (self._ids, self._points):
+            rest = table.rows()[first:][~dropped[first:]]
+            table.cut(first)
+            table.extend(rest)
 
 
 def write_ply(path: Path, points: FloatArray, centres: FloatArray | None = None) -> None:

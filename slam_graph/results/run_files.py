@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING
 
 from slam_graph.datasets import kalibr_text
 from slam_graph.files import Files
+from slam_graph.free_memory import give_back
 from slam_graph.results import result_files as names
-from slam_graph.results.free_memory import give_back
 from slam_graph.results.map_output import save_map, write_ply
 from slam_graph.results.object_files import save_objects
 from slam_graph.results.result_files import MAP_NAME, ResultFolder

@@ -24,13 +24,11 @@ class StepLog:
     """A growing table with a row for each frame in which Gauss-Newton steps were taken."""
 
     def __init__(self) -> None:
-        self._stamps_ns = array("q")
-        self._steps = array("i")
-        self._columns = array("i")
+        self._numbers = GrowingTable(3, np.int64)  # stamp, steps, columns
         self._costs = GrowingTable(2)
 
     def __len__(self) -> int:
-        return len(self._stamps_ns)
+        return len(self._numbers)
 
     def append(self, stamp_ns: int, costs: Sequence[float], columns: int) -> None:
         """Add a frame.
@@ -40,32 +38,29 @@ class StepLog:
             costs: before the first step and after each; at least one.
             columns: dimension of the state.
         """
-        self._columns.append(columns)
-        self._stamps_ns.append(stamp_ns)
-        self._steps.append(len(costs) - 1)
+        self._numbers.append((stamp_ns, len(costs) - 1, columns))
         self._costs.append((costs[0], costs[-1]))
 
     def forget_from(self, stamp_ns: int) -> None:
         """Forget the frames at and after a time."""
-        kept = bisect_left(self._stamps_ns, stamp_ns)
-        for column in (self._stamps_ns, self._steps, self._columns):
-            del column[kept:]
+        kept = int(self.stamps_ns.searchsorted(stamp_ns))
+        self._numbers.cut(kept)
         self._costs.cut(kept)
 
     @property
     def stamps_ns(self) -> IntArray:
         """(N,) times of the frames."""
-        return np.array(self._stamps_ns, dtype=np.int64)
+        return self._numbers.rows()[:, 0]
 
     @property
     def steps(self) -> IntArray:
         """(N,) numbers of steps that were taken."""
-        return np.array(self._steps, dtype=np.int64)
+        return self._numbers.rows()[:, 1]
 
     @property
     def columns(self) -> IntArray:
         """(N,) dimensions of the state while the steps were taken."""
-        return np.array(self._columns, dtype=np.int64)
+        return self._numbers.rows()[:, 2]
 
     @property
     def costs(self) -> FloatArray:
@@ -83,27 +78,24 @@ class InnovationLog:
     """A growing table with a row for each frame whose features were tested by the gate."""
 
     def __init__(self) -> None:
-        self._stamps_ns = array("q")
-        self._counts = GrowingTable(len(_COUNTS), np.int32)
+        self._counts = GrowingTable(1 + len(_COUNTS), np.int64)  # stamp, counts
         self._sums = GrowingTable(len(_SUMS), np.float32)
         self._tested = self._rejected = 0
 
     def __len__(self) -> int:
-        return len(self._stamps_ns)
+        return len(self._counts)
 
     def append(self, stamp_ns: int, innovations: Innovations) -> None:
         """Add a frame, unless no feature was tested in it."""
         if innovations.tested:
-            self._stamps_ns.append(stamp_ns)
-            self._counts.append(_counts_of(innovations))
+            self._counts.append((stamp_ns, *_counts_of(innovations)))
             self._sums.append(_sums_of(innovations))
             self._tested += innovations.tested
             self._rejected += innovations.rejected
 
     def forget_from(self, stamp_ns: int) -> None:
         """Forget the frames at and after a time."""
-        kept = bisect_left(self._stamps_ns, stamp_ns)
-        del self._stamps_ns[kept:]
+        kept = int(self.stamps_ns.searchsorted(stamp_ns))
         self._counts.cut(kept)
         self._sums.cut(kept)
         columns = self.columns()
@@ -117,11 +109,12 @@ class InnovationLog:
     @property
     def stamps_ns(self) -> IntArray:
         """(N,) times of the frames."""
-        return np.array(self._stamps_ns, dtype=np.int64)
+        return self._counts.rows()[:, 0]
 
     def columns(self) -> dict[str, FloatArray]:
         """(N,) values of each attribute of `Innovations`, by its name."""
-        counts, sums = (table.rows().astype(np.float64) for table in (self._counts, self._sums))
+        counts = self._counts.rows()[:, 1:].astype(np.float64)
+        sums = self._sums.rows().astype(np.float64)
         columns = dict(zip((*_COUNTS, *_SUMS), (*counts.T, *sums.T), strict=True))
         return {name: columns[name] for name in _KINDS}
 
@@ -202,7 +195,7 @@ class TimingLog:
     """
 
     def __init__(self) -> None:
-        self._stamps_ns = array("q")
+        self._stamps_ns = GrowingTable(1, np.int64)
         self._columns: dict[str, array[float]] = {}
 
     def __len__(self) -> int:
@@ -219,7 +212,7 @@ class TimingLog:
     @property
     def stamps_ns(self) -> IntArray:
         """(N,) times of the frames."""
-        return np.array(self._stamps_ns, dtype=np.int64)
+        return self._stamps_ns.rows()[:, 0]
 
     def column(self, stage: str) -> FloatArray:
         """(N,) milliseconds of a stage."""
@@ -247,7 +240,7 @@ class TimingLog:
         stages = self.stages()
         yield ",".join(["stamp_ns", *(f"{stage}_ms" for stage in stages)]) + "\n"
         columns = [self._columns[stage] for stage in stages]
-        for index, stamp_ns in enumerate(self._stamps_ns):
+        for index, stamp_ns in enumerate(self.stamps_ns.tolist()):
             cells = (column[index] for column in columns)
             text = ("" if np.isnan(cell) else f"{cell:.4f}" for cell in cells)
             yield ",".join([str(stamp_ns), *text]) + "\n"

@@ -20,7 +20,6 @@ from slam_graph.errors import DataError, EstimationError
 from slam_graph.geometry import AlignmentMode, StateHistory, Trajectory
 from slam_graph.results import metrics as tables
 from slam_graph.results.folders_written import FoldersWritten
-from slam_graph.results.free_memory import give_back
 from slam_graph.results.localization_result import LocalizationLog
 from slam_graph.results.map_output import PointMap
 from slam_graph.results.object_files import objects_table
@@ -257,6 +256,8 @@ class RunResult(RunSummary):
         first, last = self.input.states_ns
         near = truth.stamps_ns >= first - _TRUTH_MARGIN_NS
         near &= truth.stamps_ns <= last + _TRUTH_MARGIN_NS
+        if near.all():  # a copy would be kept as long
+            return truth if len(truth) else None
         return truth.select(near) if near.any() else None
 
     @property
@@ -362,11 +363,6 @@ class RunResult(RunSummary):
         from slam_graph.results.snapshot import save_so_far
 
         save_so_far(self, Path(folder), wall_s)
-
-    @staticmethod
-    def give_back_memory() -> None:
-        """Give memory that was freed back to the system, before what takes much of it."""
-        give_back()
 
     def _known_map(self) -> SlamMap | None:
         return self.slam_map

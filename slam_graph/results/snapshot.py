@@ -7,9 +7,9 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+from slam_graph.free_memory import give_back
 from slam_graph.results import result_files as names
 from slam_graph.results.folders_written import GOES_ON
-from slam_graph.results.free_memory import give_back
 from slam_graph.results.map_output import PointMap
 from slam_graph.results.run_files import save_causal, save_frames, save_rigs
 from slam_graph.results.run_input import Ending

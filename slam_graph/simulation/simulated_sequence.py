@@ -120,9 +120,9 @@ class SimulatedSequence(RecordedSequence):
         gyro_biases, accel_biases = self.flight.imu.biases(stamps)
         return Trajectory(
             stamps,
-            motion.positions(stamps),
+            motion.positions(stamps).copy(),  # not the whole of what they are columns of
             motion.rotations(stamps).as_quat(),
-            motion.velocities(stamps),
+            motion.velocities(stamps).copy(),
             accel_biases=accel_biases,
             gyro_biases=gyro_biases,
         )

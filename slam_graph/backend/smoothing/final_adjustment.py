@@ -143,7 +143,7 @@ class FinalBa:
                 None if end_ns is None else end_ns - offset_ns,
             )
             try:
-                chosen = causal.select(inside)
+                chosen = causal if inside.all() else causal.select(inside)
                 if consistent:
                     task = SmoothingTask.of(rig, backend, config)
                     part = part.without(causal_outliers(part, chosen, task))

@@ -28,6 +28,7 @@ from slam_graph.backend.smoothing.state_elimination import (
     ChainEquations,
     EliminatedStates,
 )
+from slam_graph.free_memory import give_back
 from slam_graph.sensors import AidingData
 
 logger = logging.getLogger(__name__)
@@ -163,7 +164,7 @@ class EliminatedMinimum:
 
 def equations_at_minimum(
     found: Minimum,
-    near: EliminatedStates | None,
+    take_near: Callable[[], EliminatedStates | None],
     factors: RecordingFactors,
     learn: bool,
     keep: bool,
@@ -178,8 +179,9 @@ def equations_at_minimum(
 
     Args:
         found: the minimum.
-        near: the factor of the cost somewhere near, if there is one. It is good enough to say how
-            much of the residuals the images can contradict.
+        take_near: gives the factor of the cost somewhere near, if there is one, and keeps it no
+            longer, as it is large. It is good enough to say how much of the residuals the images
+            can contradict.
         factors: of the IMU; their noise becomes what was learned.
         learn: whether to estimate the noise of the IMU.
         keep: whether to keep what images say.
@@ -190,10 +192,11 @@ def equations_at_minimum(
         RuntimeError: if GTSAM cannot linearise a factor.
         LinAlgError: if the cost does not determine all variables.
     """
+    give_back()  # arrays of the steps, before those that take most
     images, cost, given = _LinearImages(found), found.cost, factors.noise
     inertial, states, moved = cost.inertial, None, found.estimates
     if learn:
-        learned = _learned(found, images, near, factors, count_step)
+        learned = _learned(found, images, take_near, factors, count_step)
         if learned is None:
             factors.noise = given
             images.reset()
@@ -216,7 +219,7 @@ def equations_at_minimum(
 def _learned(
     found: Minimum,
     images: _LinearImages,
-    near: EliminatedStates | None,
+    take_near: Callable[[], EliminatedStates | None],
     factors: RecordingFactors,
     count_step: Callable[[], None],
 ) -> tuple[gtsam.NonlinearFactorGraph, EliminatedStates | None, Estimates] | None:
@@ -228,13 +231,15 @@ def _learned(
     """
     cost, values, inertial = found.cost, found.estimates.states, found.cost.inertial
     states: EliminatedStates | None = None
+    known: EliminatedStates | None
     try:
-        known = near or images.factor(_chain(_with_gauge(inertial, factors, values), values))
+        known = take_near() or images.factor(_chain(_with_gauge(inertial, factors, values), values))
         for _ in range(_ROUNDS):
             if not factors.learn_noise(inertial, values, known.times_covariance):
                 break
             inertial = factors.reweighted(inertial, values)
             chain = _chain(_with_gauge(inertial, factors, values), values)
+            known = states = None  # the one before goes before there is another: they are large
             known = states = images.factor(chain)
             values = moved_states(values, images.step(known, chain))
             count_step()

@@ -355,13 +355,14 @@ class BundleAdjustment:
             RuntimeError: if GTSAM cannot linearise a factor.
             LinAlgError: if the minimum does not determine all variables.
         """
-        near, self._factor = self._factor, None  # it is large
+        if not self._config.learn_imu_noise:
+            self._factor = None
         columns = None
         if self._task.calibration:
             columns = CalibrationColumns.of(self._rig, self._keyframe_states(), self._segment.imu)
         minimum = equations_at_minimum(
             self._minimum,
-            near,
+            self._take_factor,
             self._factors,
             self._config.learn_imu_noise,
             self._task.joint,
@@ -372,6 +373,11 @@ class BundleAdjustment:
         stamps_ns, keyframes = self._segment.stamps_ns, self._segment.keyframes
         features = self._minimum.cost.images.obs.ids
         return PoseEquations.of(minimum, stamps_ns, keyframes, densities, level, features)
+
+    def _take_factor(self) -> EliminatedStates | None:
+        """The factor of the last step, if there is one, which is kept no longer: it is large."""
+        factor, self._factor = self._factor, None
+        return factor
 
     def _note_motions(self) -> None:
         """Take the current velocities for the motion between the rows of rolling shutters."""

@@ -14,6 +14,7 @@ from slam_graph.backend.smoothing.recording_problem import BundleAdjustment
 from slam_graph.backend.smoothing.smoothing_task import AdjustedSegment, SegmentStart, SmoothingTask
 from slam_graph.backend.smoothing.track_fusion import with_fused_features
 from slam_graph.errors import EstimationError
+from slam_graph.free_memory import give_back
 
 logger = logging.getLogger(__name__)
 
@@ -30,9 +31,11 @@ def adjust_segment(
     start: SegmentStart, task: SmoothingTask, progress: SegmentProgress
 ) -> AdjustedSegment:
     """The minimum of a segment with fused features; if fusion fails, with the original tracks."""
+    give_back()  # what the segment before took
     if task.config.fuse_features:
         try:
             fused, steps = with_fused_features(start, task, progress.fusing)
+            give_back()  # arrays of half the keyframes; those of all of them find no place in these
 
             def report(step: int, passes: int) -> None:
                 progress.solving(steps + step, passes)
