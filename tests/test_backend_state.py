@@ -60,7 +60,7 @@ def test_poses_are_those_of_the_values(state: State) -> None:
     """To the bit, also where a camera's pose is a variable, after a step and with a new frame."""
     mounting = gtsam.Values()
     mounting.insert(E(1), pose3=gtsam.Pose3())
-    state.insert_calibration(mounting)
+    state.insert(mounting)
     keys = [E(1), *imu_state_keys(0), *imu_state_keys(1)]
     for _ in range(2):
         for first, values in ((False, state.frames), (True, state.first_frames)):
@@ -132,7 +132,7 @@ def test_the_key_of_distortion_coefficients_holds_their_number(coefficients: int
     made = State()
     values = gtsam.Values()
     values.insert(keys[1], np.arange(float(coefficients)))
-    made.insert_calibration(values)
+    made.insert(values)
     made.update(Layout(dims_of(keys[1:2])), np.ones(coefficients))
     made.relinearize()
     np.testing.assert_array_equal(made.first.atVector(keys[1]), 1.0 + np.arange(coefficients))

@@ -17,8 +17,9 @@ from slam_graph.backend.aiding.fix_calibration import (
     calibrated_factor,
 )
 from slam_graph.backend.aiding.fix_factors import PositionFix
+from slam_graph.backend.aiding.path_of_fixes import PathFix
 from slam_graph.backend.aiding.regauging import with_free_gauge
-from slam_graph.backend.aiding.world_alignment import PathFix, align_world
+from slam_graph.backend.aiding.world_alignment import align_world
 from slam_graph.backend.backend_config import GnssConfig
 from slam_graph.backend.smoothing.calibrated_fixes import CalibratedFixes, EliminatedFixes
 from slam_graph.backend.smoothing.state_elimination import (

@@ -17,7 +17,8 @@ from scipy.spatial.transform import Rotation
 from slam_graph import run
 from slam_graph.arrays import FloatArray
 from slam_graph.backend.aiding.fix_factors import OrientationFix, PositionFix, fixes_of
-from slam_graph.backend.aiding.world_alignment import PathFix, align_world
+from slam_graph.backend.aiding.path_of_fixes import PathFix
+from slam_graph.backend.aiding.world_alignment import align_world
 from slam_graph.backend.backend_config import BackendConfig
 from slam_graph.datasets import open_dataset
 from slam_graph.datasets.streams.aiding_files import aiding_texts, read_aiding

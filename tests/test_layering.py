@@ -13,7 +13,7 @@ import slam_graph
 PACKAGE = Path(slam_graph.__file__).parent
 
 LAYERS = (
-    {"errors", "diagnostics", "version", "arrays", "free_memory", "lazy", "interrupts"},
+    {"errors", "diagnostics", "version", "arrays", "lazy", "interrupts"},
     {"files", "image_files", "kernels", "plugins", "display"},
     {"settings", "geometry"},
     {"sensors"},

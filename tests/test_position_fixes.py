@@ -18,8 +18,9 @@ from slam_graph import run
 from slam_graph.arrays import FloatArray
 from slam_graph.backend.aiding.aiding_factors import Aiding
 from slam_graph.backend.aiding.fix_factors import FixGate, PositionFix
+from slam_graph.backend.aiding.path_of_fixes import PathFix
 from slam_graph.backend.aiding.regauging import gauge_directions, with_free_gauge
-from slam_graph.backend.aiding.world_alignment import PathFix, WorldAlignment, align_world
+from slam_graph.backend.aiding.world_alignment import WorldAlignment, align_world
 from slam_graph.backend.backend_config import BackendConfig
 from slam_graph.backend.solve.square_root import Layout, SquareRootInformation, triangularize
 from slam_graph.backend.solve.state import State, dims_of

@@ -94,11 +94,11 @@ class Estimator(EstimatorKnowledge):
         self.clock_changes = clock_change.ClockChanges()
         dynamics = self._dynamics = Dynamics.of(with_depth_camera(rig), algorithm, config)
         rig, algorithm, config = dynamics.rig, dynamics.algorithm, dynamics.config
-        self._make_engine: Callable[[EngineContext], Engine] = SquareRootEngine
-        if algorithm.engine != "square_root":
-            self._make_engine = SmootherEngine
+        own = algorithm.engine == "square_root"
+        make: Callable[[EngineContext], Engine] = SquareRootEngine if own else SmootherEngine
+        self._make_engine = make
         self._check = StartCalibration(rig, config)
-        self.aiding = Aiding(config, rig.has_imu, algorithm.engine == "square_root")
+        self.aiding = Aiding(config, rig.has_imu, own, rig.scaled_camera)
         self._given: NavState | None = None
         self._before: NavState | None = None
         self._held: deque[FeatureFrame] | None = None

@@ -113,6 +113,11 @@ class EstimatorKnowledge:
         return TrackFit(config.noise.pixel_sigma)
 
     @property
+    def scaled_camera(self) -> gtsam.Pose3 | None:
+        """body_T_camera of the camera whose path is up to scale so far; None for metres."""
+        return None if self.aiding.aligned else self.rig.scaled_camera
+
+    @property
     def joint(self) -> SegmentJoint | None:
         """How the present segment continues the one before; None in the first."""
         return self._start_up.joint

@@ -103,7 +103,7 @@ class CalibrationVariables:
         """
         if not self.keys:
             return prior
-        state.insert_calibration(self._nominal_values())
+        state.insert(self._nominal_values())
         state.freeze(self.keys)
         sigmas = np.concatenate([self._sigmas(key) for key in self.keys])
         n = prior.layout.size

@@ -57,6 +57,24 @@ class PosedFrame:
         """The same in a world that is moved by `new_T_old`."""
         return self.at(motion.compose(gtsam.Pose3(gtsam.Rot3(self.rotation), self.position)))
 
+    def rescaled(self, scale: float, camera: gtsam.Pose3) -> PosedFrame:
+        """The same where the path of the camera, at body_T_camera, has another unit of length."""
+        pose = gtsam.Pose3(gtsam.Rot3(self.rotation), self.position)
+        return self.at(self.rescaled_pose(pose, scale, camera))
+
+    @staticmethod
+    def rescaled_pose(world_T_body: gtsam.Pose3, scale: float, camera: gtsam.Pose3) -> gtsam.Pose3:
+        """A pose where the path of a camera has another unit of length, and its mounting has not.
+
+        Args:
+            world_T_body: with the path of the camera in the old unit.
+            scale: new units per old one.
+            camera: body_T_camera, in the new unit in either case.
+        """
+        seen_from = world_T_body.compose(camera)
+        there = gtsam.Pose3(seen_from.rotation(), scale * seen_from.translation())
+        return there.compose(camera.inverse())
+
     def unrolled(self, seen: FeatureObservations, points: FloatArray, rig: Rig) -> FloatArray:
         """(N, 2) where the first camera sees features on the plane z = 1, all from the pose.
 

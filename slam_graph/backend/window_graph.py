@@ -201,7 +201,7 @@ def _projection_error(
         _: gtsam.CustomFactor, values: gtsam.Values, H: list[FloatArray] | None
     ) -> FloatArray:
         state = State()
-        state.insert_calibration(_calibration_in(values, keys[2:]))
+        state.insert(_calibration_in(values, keys[2:]))
         state.motions = motions
         now = rig.at(state)
         point = np.asarray(values.atPoint3(keys[1]))[None]

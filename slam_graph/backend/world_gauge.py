@@ -7,6 +7,8 @@ A trajectory, or a segment of one, is known relative to a state that was given i
 of them is added to the covariances of its states. Without an IMU nothing measures gravity, and they
 are six: position and all of the rotation. A covariance of the gauge has the position first, in axes
 of the world, then the rotation: about the vertical (4, 4), or about the axes of the world (6, 6).
+One camera alone does not know its unit of length either: then they are seven, and the logarithm of
+the scale comes last (7, 7).
 """
 
 from __future__ import annotations
@@ -101,13 +103,17 @@ def in_gauge_of(link: NavState, states: list[NavState], level: bool = True) -> l
     return [with_unknown_gauge(state, unknown, place) for state in states]
 
 
-def with_unknown_gauge(state: NavState, unknown: FloatArray, centre: FloatArray) -> NavState:
+def with_unknown_gauge(
+    state: NavState, unknown: FloatArray, centre: FloatArray, camera: gtsam.Pose3 | None = None
+) -> NavState:
     """A state with the uncertainty of the gauge of its world added.
 
     Args:
         state: with its covariance in that world; without one it stays as it is.
-        unknown: (4, 4) or (6, 6) covariance of the gauge (m, rad).
-        centre: (3,) the point about which the world turns.
+        unknown: (4, 4), (6, 6) or (7, 7) covariance of the gauge (m, rad, logarithm of the scale).
+        centre: (3,) the point about which the world turns and is scaled.
+        camera: body_T_camera of the camera whose path is scaled; what turns of the body add to its
+            velocity is neglected.
     """
     if state.covariance is None:
         return state
@@ -115,6 +121,11 @@ def with_unknown_gauge(state: NavState, unknown: FloatArray, centre: FloatArray)
     body_R_world = state.world_T_body.rotation().matrix().T
     N = np.zeros((_ERROR, len(unknown)))
     moved = gauge_motion((state.world_T_body.translation() - centre)[None], level)[0]
-    N[_ROTATION], N[_POSITION] = body_R_world @ moved[:3], body_R_world @ moved[3:]
-    N[_VELOCITY, 3:] = np.cross(turned_axes(level), state.velocity).T
+    given = slice(0, moved.shape[1])
+    N[_ROTATION, given], N[_POSITION, given] = body_R_world @ moved[:3], body_R_world @ moved[3:]
+    axes = turned_axes(level)
+    N[_VELOCITY, 3 : 3 + len(axes)] = np.cross(axes, state.velocity).T
+    if camera is not None:
+        seen_from = state.world_T_body.transformFrom(camera.translation())
+        N[_POSITION, -1], N[_VELOCITY, -1] = body_R_world @ (seen_from - centre), state.velocity
     return replace(state, covariance=state.covariance + N @ unknown @ N.T)

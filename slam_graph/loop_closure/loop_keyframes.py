@@ -70,6 +70,16 @@ class Keyframe:
         views = tuple(view.moved(motion) for view in self.views)
         return replace(self, world_T_body=motion.compose(self.world_T_body), views=views)
 
+    def rescaled(self, scale: float, camera: gtsam.Pose3) -> Keyframe:
+        """The same where the path of the camera, at body_T_camera, has another unit of length."""
+        centre = camera.translation()
+        return replace(
+            self,
+            world_T_body=PosedFrame.rescaled_pose(self.world_T_body, scale, camera),
+            points=centre + scale * (self.points - centre),
+            views=tuple(view.rescaled(scale, camera) for view in self.views),
+        )
+
     def world_points(self, world_T_body: gtsam.Pose3 | None = None) -> tuple[IntArray, FloatArray]:
         """Ids (M,) and world positions (M, 3) of the known points, from this pose or another."""
         pose = world_T_body or self.world_T_body
@@ -191,15 +201,24 @@ class KeyframeLog:
         self.keyframes.append(keyframe)
         return keyframe
 
-    def move(self, motion: gtsam.Pose3, after_ns: int | None = None) -> None:
-        """Go on in a world that is moved by `new_T_old`, with the keyframes after a time."""
-        self.keyframes = [
-            k.moved(motion) if after_ns is None or k.stamp_ns > after_ns else k
-            for k in self.keyframes
-        ]
-        self._recent = deque((view.moved(motion) for view in self._recent), maxlen=POINT_FRAMES)
-        last = ((stamp_ns, motion.compose(pose)) for stamp_ns, pose in self._last)
-        self._last = deque(last, maxlen=self.LAST_POSES)
+    def move(self, motion: gtsam.Pose3, after_ns: int | None = None, scale: float = 1.0) -> None:
+        """Go on in a world that is moved by `new_T_old`, with the keyframes after a time.
+
+        Args:
+            motion: of the world.
+            after_ns: the time; None for all keyframes.
+            scale: by which the path of the camera is scaled before.
+        """
+        keyframes, recent, last = self.keyframes, list(self._recent), list(self._last)
+        if scale != 1.0:
+            camera = self.rig.cameras[0].body_T_camera
+            keyframes = [k if _stays(k, after_ns) else k.rescaled(scale, camera) for k in keyframes]
+            recent = [view.rescaled(scale, camera) for view in recent]
+            last = [(ns, PosedFrame.rescaled_pose(pose, scale, camera)) for ns, pose in last]
+        self.keyframes = [k if _stays(k, after_ns) else k.moved(motion) for k in keyframes]
+        self._recent = deque((view.moved(motion) for view in recent), maxlen=POINT_FRAMES)
+        moved = ((stamp_ns, motion.compose(pose)) for stamp_ns, pose in last)
+        self._last = deque(moved, maxlen=self.LAST_POSES)
 
     def at(self, trajectory: Trajectory) -> list[Keyframe]:
         """The keyframes at the poses of a trajectory; those outside of it keep their poses.
@@ -251,3 +270,8 @@ class KeyframeLog:
         points = np.where(good[:, None], found.points, np.nan)
         body: FloatArray = (points - world_T_body.translation()) @ world_T_body.rotation().matrix()
         return body
+
+
+def _stays(keyframe: Keyframe, after_ns: int | None) -> bool:
+    """Whether a keyframe is not after a time; None for none."""
+    return after_ns is not None and keyframe.stamp_ns <= after_ns

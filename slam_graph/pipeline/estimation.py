@@ -188,6 +188,7 @@ class Estimation:
             corrected_rig=estimator.corrected_rig,
             restarted=estimator.replayed is not None or lost,
             world_motion=self._recovery.world_motion,
+            world_scale=self._recovery.world_scale,
             waits=not lost and estimator.solved_ns != features.stamp_ns,
             milliseconds=tracked.clock.milliseconds,
             counts=tracked.frame_stats,
@@ -286,7 +287,7 @@ class Estimation:
         if not estimator.initialized:
             self._start_from_known_state(time_ns)
         estimator.add_imu(tracked.packet.imu)
-        if tracked.packet.aiding is not None and estimator.rig.has_scale:
+        if tracked.packet.aiding is not None:
             estimator.aiding.add(tracked.packet.aiding)
         self._recovery.check_recorded(time_ns)
         with _solvable(f"frame {stamp_ns}"):

@@ -86,7 +86,7 @@ class Keyframes(Stage):
     def frame(self, frame: EstimatedFrame) -> None:
         """Take a frame, if there is an estimate."""
         if frame.restarted:
-            self._restart(frame.world_motion)
+            self._restart(frame.world_motion, frame.world_scale)
         state = frame.state
         if state is None or frame.waits:
             return
@@ -97,15 +97,16 @@ class Keyframes(Stage):
         self._log.add(features, state.world_T_body, frame.image)
         self.seconds += time.perf_counter() - began
 
-    def _restart(self, motion: gtsam.Pose3 | None) -> None:
+    def _restart(self, motion: gtsam.Pose3 | None, scale: float) -> None:
         """Keep the keyframes of segments that have ended, and forget those after them.
 
         Args:
             motion: new_T_old of the worlds, if those after them have moved instead.
+            scale: by which they were scaled before.
         """
         result, earlier, good_ns = self._result, self._log.keyframes, self._result.segments.ended_ns
         if motion is not None:
-            self._log.move(motion, good_ns)
+            self._log.move(motion, good_ns, scale)
             return
         self._log = KeyframeLog(result.causal_rig, result.config.loop_closure.keyframes)
         if good_ns is not None:

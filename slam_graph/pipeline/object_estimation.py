@@ -104,7 +104,8 @@ class Objects(NoObjects):
     def _begin_again(self, frame: EstimatedFrame) -> None:
         """Begin without objects; those so far move if the platform's states have moved."""
         found, ended_ns = self._estimator.aiding.found, self._result.segments.ended_ns
-        if frame.world_motion is not None and found is not None:
+        rigid = frame.world_motion is not None and frame.world_scale == 1.0
+        if rigid and found is not None:
             self._objects.settle(
                 found, np.iinfo(np.int64).min if ended_ns is None else ended_ns + 1
             )

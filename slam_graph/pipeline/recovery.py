@@ -46,6 +46,7 @@ class Recovery:
     Attributes:
         world_motion: new_T_old, if the last frame has moved all states of the segment with their
             world.
+        world_scale: by which these were scaled before that.
     """
 
     def __init__(self, result: RunResult, estimator: Estimator, diagnostics: Diagnostics) -> None:
@@ -54,6 +55,7 @@ class Recovery:
         self._recent: deque[NavState] = deque()
         self._short = 0
         self.world_motion: gtsam.Pose3 | None = None
+        self.world_scale = 1.0
 
     @property
     def agreement(self) -> Agreement:
@@ -68,16 +70,19 @@ class Recovery:
     def append(self, states: list[NavState]) -> None:
         """Note new states; the first after a start begins a segment."""
         joint, result = self._estimator.joint, self._result
+        of_fixes = self._estimator.aiding.aligned
         for state in states:
             if joint is None:
-                result.segments.add(state.stamp_ns)
+                result.segments.add(state.stamp_ns, of_fixes=of_fixes)
                 result.history.append(state)
             else:
-                result.segments.add(state.stamp_ns, joint.covariance, joint.holds)
+                result.segments.add(state.stamp_ns, joint.covariance, joint.holds, of_fixes)
                 result.history.append(joint.added_to(state))
             self._recent.append(state)
             while self._recent[0].stamp_ns < state.stamp_ns - _REMEMBERED_NS:
                 self._recent.popleft()
+        measured = result.segments.all_of_fixes
+        result.history.scaled_camera = None if measured else result.input.rig.scaled_camera
 
     def supersede(self, by: list[NavState]) -> None:
         """Forget the states of the present segment, as others come in their place.
@@ -89,7 +94,8 @@ class Recovery:
         segments.forget_last()
         since_ns = segments[-1].end_ns + 1 if len(segments) else None
         self.world_motion = self._motion_to(by, since_ns)
-        self._result.forget_states(since_ns, self.world_motion is not None)
+        rigid = self.world_motion is not None and self.world_scale == 1.0
+        self._result.forget_states(since_ns, rigid)
         self._agreement = Agreement(self._result.config)
         self._recent = deque(s for s in self._recent if since_ns and s.stamp_ns < since_ns)
 
@@ -99,11 +105,11 @@ class Recovery:
         recent = [s for s in self._recent if since_ns is None or s.stamp_ns >= since_ns]
         if found is None or not recent:
             return None
-        for state in recent:
+        for state in found.moved(recent):
             there = poses.get(state.stamp_ns)
-            moved = found.motion.compose(state.world_T_body)
-            if there is None or not there.equals(moved, _SAME):
+            if there is None or not there.equals(state.world_T_body, _SAME):
                 return None
+        self.world_scale = found.scale
         return found.motion
 
     def check_recorded(self, time_ns: int) -> None:

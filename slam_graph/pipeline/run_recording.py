@@ -36,7 +36,7 @@ from slam_graph.pipeline.stage import NoObjects, Stage
 from slam_graph.pipeline.supervision import finish, outcome
 from slam_graph.pipeline.tracking import TrackedPacket, Tracking, can_overlap, packets_of
 from slam_graph.pipeline.verdict import Verdict
-from slam_graph.pipeline.world_of_fixes import is_in_world_of_fixes
+from slam_graph.pipeline.world_of_fixes import NOT_TOLD, is_in_world_of_fixes, why_no_scale
 from slam_graph.results import RunInput, RunResult
 
 if TYPE_CHECKING:
@@ -44,11 +44,6 @@ if TYPE_CHECKING:
 
 
 logger = logging.getLogger(__name__)
-
-_NO_SCALE = (
-    "one camera without an IMU or odometry: all lengths are up to scale; "
-    "fixes and known poses are not used"
-)
 
 _LEAST_ODOMETRY_S = 1.0
 """Odometry of less time is not waited for, where it would tell the unit of length."""
@@ -100,10 +95,11 @@ def run(
     result.history.level, result.history.scaled_camera = rig.has_imu, rig.scaled_camera
     if result.input.truth is not None and result.groundtruth is None:
         sequence.diagnostics.warn("groundtruth_elsewhere", _truth_elsewhere(result.input))
-    if not rig.has_scale:
-        sequence.diagnostics.warn("scale_unknown", _NO_SCALE)
-        if isinstance(sequence, RecordedSequence) and len(sequence.aiding.odometry_stamps_ns):
-            sequence.diagnostics.warn("odometry_unused", ODOMETRY_UNUSED)
+    known = sequence.aiding if isinstance(sequence, RecordedSequence) else None
+    if no_scale := why_no_scale(known, result.input):
+        sequence.diagnostics.warn("scale_unknown", no_scale)
+    if not rig.has_scale and known is not None and len(known.odometry_stamps_ns):
+        sequence.diagnostics.warn("odometry_unused", ODOMETRY_UNUSED)
     places = _place_stages(sequence, result, known_map)
     tracking = _tracking(sequence, result.input)
     estimation = Estimation(sequence, result)
@@ -135,6 +131,8 @@ def run(
                     interrupts.check()
                 estimation.finish()
             interrupts.check()
+        if len(result.history) and not (result.history.has_scale or no_scale):
+            diagnostics.warn("scale_unknown", NOT_TOLD)
         finish(stages, result, interrupts)
     result.warnings = +sequence.diagnostics.counts
     return result

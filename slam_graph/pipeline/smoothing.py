@@ -14,7 +14,7 @@ from slam_graph import backend
 from slam_graph.arrays import FloatArray
 from slam_graph.diagnostics import Diagnostics
 from slam_graph.errors import EstimationError, SlamGraphError
-from slam_graph.free_memory import give_back
+from slam_graph.kernels.free_memory import give_back
 from slam_graph.pipeline.observers import Progress
 from slam_graph.pipeline.stage import (
     COMPLETED,
@@ -83,8 +83,7 @@ class Smoothing(Stage):
             return
         try:
             packet = frame.packet
-            aiding = packet.aiding if self._log.rig.has_scale else None
-            self._log.add(packet.imu, frame.features, frame.imu_noise, aiding)
+            self._log.add(packet.imu, frame.features, frame.imu_noise, packet.aiding)
             if frame.clock_changes is not None:
                 self._log.clock_changes = frame.clock_changes
             self._log.georeferenced = frame.georeferenced
@@ -195,12 +194,15 @@ class Smoothing(Stage):
         """
         result = self._result
         segments = result.segments
-        parts: list[tuple[int, int | None, FloatArray]] = [
-            (group[0].begin_ns, group[-1].end_ns, group[0].joint_covariance)
+        parts: list[tuple[int, int | None, FloatArray, bool]] = [
+            (
+                *(group[0].begin_ns, group[-1].end_ns, group[0].joint_covariance),
+                all(segment.of_fixes for segment in group),
+            )
             for group in segments.worlds()
         ]
         if segments.goes_on:  # the last one has the rest of the recording
-            parts[-1] = parts[-1][0], None, parts[-1][2]
+            parts[-1] = parts[-1][0], None, *parts[-1][2:]
         return backend.FinalBa.of_worlds(
             log,
             result.trajectory,

@@ -54,6 +54,7 @@ class EstimatedFrame:
         corrected_rig: the calibration, where the estimator has corrected it; None otherwise.
         restarted: whether the estimator began anew at this frame, in another world.
         world_motion: new_T_old, if all states of the segment have moved with their world.
+        world_scale: by which the path of the camera was scaled before that.
         waits: whether this frame waits for IMU samples, and the state is that of an earlier one.
         milliseconds: of each stage, of its parts as `stage.part`, and of all as `total`.
         counts: what the front end counts, by name.
@@ -78,6 +79,7 @@ class EstimatedFrame:
     corrected_rig: Rig | None = None
     restarted: bool = False
     world_motion: gtsam.Pose3 | None = None
+    world_scale: float = 1.0
     waits: bool = False
     milliseconds: Mapping[str, float] = field(default_factory=dict)
     counts: Mapping[str, float] = field(default_factory=dict)

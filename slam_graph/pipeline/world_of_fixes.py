@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""Whether a ground truth is in the world of position fixes, so that nothing need be aligned."""
+"""What position fixes tell: the world, which a ground truth may share, and the unit of length."""
 
 from __future__ import annotations
 
@@ -10,12 +10,52 @@ from scipy.spatial.transform import Rotation
 from slam_graph.backend import BackendConfig
 from slam_graph.errors import DataError
 from slam_graph.geometry import Similarity, Trajectory, interpolate
+from slam_graph.results import RunInput
 from slam_graph.sensors import AidingData
+
+NO_SCALE = "one camera without an IMU, odometry or position fixes: all lengths are up to scale"
+NOT_FOR_SMOOTHERS = (
+    "GTSAM's smoothers take no scale from position fixes, which are not used: all lengths of one "
+    "camera without an IMU or odometry are up to scale; use msckf, swf, okvis, ekf or iekf"
+)
+NOT_TOLD = (
+    "position fixes did not tell the scale of one camera without an IMU or odometry (too few, too "
+    "noisy, or along a straight line): all lengths are up to scale"
+)
 
 _LEAST_FIXES = 8
 _LARGER = 1.2
 """Fixes are at most this many times as far from the truth as from the truth aligned with them, or
 as their noise, in the median: with a hundred fixes the one scatters by a tenth around the other."""
+
+
+def usable_aiding(aiding: AidingData | None, asked: RunInput) -> AidingData | None:
+    """What of fixes, known poses and odometry a run can use.
+
+    Where nothing has told the unit of length yet, odometry does not cover enough to tell it, and
+    GTSAM's smoothers cannot take it from fixes.
+    """
+    if aiding is None or asked.rig.has_scale:
+        return aiding
+    own_engine = asked.config.algorithm.engine == "square_root"
+    return aiding.without_odometry() if own_engine else None
+
+
+def why_no_scale(aiding: AidingData | None, asked: RunInput) -> str:
+    """Why lengths of one camera are up to scale from the beginning; empty if fixes may tell it.
+
+    Args:
+        aiding: all of the recording, as it is stamped; None if that is not known.
+        asked: which part of it, and the settings.
+    """
+    backend, offset_ns = asked.config.backend, round(asked.rig.pose_offset_s * 1e9)
+    if asked.rig.has_scale:
+        return ""
+    known = AidingData.empty() if aiding is None else backend.on_the_clock(aiding)
+    known = known.within(asked.start_ns + offset_ns - 1, asked.end_ns + offset_ns)
+    if not len(known.without_odometry()):
+        return NO_SCALE
+    return "" if usable_aiding(known, asked) is not None else NOT_FOR_SMOOTHERS
 
 
 def is_in_world_of_fixes(

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 from slam_graph.datasets import kalibr_text
 from slam_graph.files import Files
-from slam_graph.free_memory import give_back
+from slam_graph.kernels.free_memory import give_back
 from slam_graph.results import result_files as names
 from slam_graph.results.map_output import save_map, write_ply
 from slam_graph.results.object_files import save_objects

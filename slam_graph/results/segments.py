@@ -75,6 +75,7 @@ class Segment:
         loops: number of accepted loop closures to earlier segments, if loops were closed.
         place_joint: how these join it to the segment before; None without them.
         ended_by: what ended it; empty for the end of the recording.
+        of_fixes: whether its world is that of position fixes.
     """
 
     begin_ns: int
@@ -84,6 +85,7 @@ class Segment:
     loops: int = 0
     place_joint: PlaceJoint | None = None
     ended_by: str = ""
+    of_fixes: bool = False
 
     @property
     def joint_sigmas(self) -> tuple[float, float]:
@@ -148,6 +150,11 @@ class Segments:
         return any(segment.seconds >= self.SHORT_S for segment in self._all)
 
     @property
+    def all_of_fixes(self) -> bool:
+        """Whether there are segments, and all of them are in the world of position fixes."""
+        return bool(self._all) and all(segment.of_fixes for segment in self._all)
+
+    @property
     def later(self) -> list[Segment]:
         """All but the first."""
         return self._all[1:]
@@ -157,7 +164,13 @@ class Segments:
         """Time that is estimated, without what lies between segments."""
         return sum(segment.seconds for segment in self._all)
 
-    def add(self, stamp_ns: int, joint: FloatArray | None = None, joined: bool = False) -> None:
+    def add(
+        self,
+        stamp_ns: int,
+        joint: FloatArray | None = None,
+        joined: bool = False,
+        of_fixes: bool = False,
+    ) -> None:
         """Note a state: it continues the last segment, or begins one where that has ended.
 
         Args:
@@ -165,12 +178,13 @@ class Segments:
             joint: (4, 4) or (6, 6) covariance of the joint, see `Segment`, if a segment begins
                 that is not the first.
             joined: whether the joint holds.
+            of_fixes: whether a segment that begins is in the world of position fixes.
         """
         if not self.goes_on:
             by: JoinedBy = "start" if not self._all else "imu" if joined else "none"
             known = _UNKNOWN if joint is None else joint
             known = np.zeros((4, 4)) if by == "start" else known
-            self._all.append(Segment(stamp_ns, stamp_ns, by, known))
+            self._all.append(Segment(stamp_ns, stamp_ns, by, known, of_fixes=of_fixes))
         self._all[-1].end_ns = stamp_ns
 
     def end(self, good_ns: int | None, reason: str) -> float:

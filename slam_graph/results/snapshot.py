@@ -7,7 +7,7 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-from slam_graph.free_memory import give_back
+from slam_graph.kernels.free_memory import give_back
 from slam_graph.results import result_files as names
 from slam_graph.results.folders_written import GOES_ON
 from slam_graph.results.map_output import PointMap

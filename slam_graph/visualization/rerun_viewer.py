@@ -177,9 +177,9 @@ class RerunViewer:
         if self._detail == "graph":
             show_window(self._stream, estimator)
         if self._truth is not None and number % _ALIGN_FRAMES == 0:
-            free = StateHistory(estimator.rig.has_imu, estimator.rig.scaled_camera).free
+            free = StateHistory(estimator.rig.has_imu, estimator.scaled_camera).free
             alignment: AlignmentMode = "none" if estimator.start_is_given else free
-            own, camera = self._history.trajectory(), estimator.rig.scaled_camera
+            own, camera = self._history.trajectory(), estimator.scaled_camera
             self._outcome.show_truth(self._truth, own, alignment, camera)
 
     def _time_of_state(self, frame: ShownFrame) -> int:

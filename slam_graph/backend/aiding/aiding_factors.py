@@ -39,7 +39,7 @@ from slam_graph.backend.backend_config import BackendConfig
 from slam_graph.backend.solve.square_root import SquareRootInformation
 from slam_graph.backend.solve.state import State
 from slam_graph.backend.visual_motion import moved_to
-from slam_graph.backend.world_gauge import in_moved_world, with_unknown_gauge
+from slam_graph.backend.world_gauge import in_moved_world
 from slam_graph.geometry import NavState
 from slam_graph.sensors import AidingData
 
@@ -47,12 +47,6 @@ _MOST_FIXES = 300
 """Fixes that are remembered for the alignment."""
 _TIMINGS = 3
 """Alignments, each at the times that the one before has found."""
-_VAGUE = 0.5
-"""The world is taken once the error that time offset (by its σ times the mean speed) and lever arm
-(its σ) leave is below this many σ of a fix."""
-_MOST_VAGUE = 40
-"""With so many fixes it is taken in any case: on a straight road at an even speed nothing tells
-offset and lever arm."""
 _REVISED_M, _REVISED_NS = 0.01, 1_500_000_000
 """A step that moves the body by more than this (m) through lever arm and clock; images are not
 compared with the motion for this long (ns) after it."""
@@ -69,7 +63,9 @@ class Aiding:
     Args:
         config: settings.
         level: whether gravity is measured.
-        calibrates: whether the engine takes lever arm and clock of the fixes as variables.
+        calibrates: whether the engine takes lever arm and clock of the fixes as variables, and
+            goes on in another unit of length.
+        scaled_camera: body_T_camera of a camera whose unit of length is unknown; None for metres.
 
     Attributes:
         aligned: whether the world is that of the fixes.
@@ -84,9 +80,15 @@ class Aiding:
             neither is.
     """
 
-    def __init__(self, config: BackendConfig, level: bool, calibrates: bool = True) -> None:
-        self._config, self._level = config, level
-        variables = FixVariables(config.gnss)
+    def __init__(
+        self,
+        config: BackendConfig,
+        level: bool,
+        calibrates: bool = True,
+        scaled_camera: gtsam.Pose3 | None = None,
+    ) -> None:
+        self._config, self._level, self._scaled_camera = config, level, scaled_camera
+        self._calibrates, variables = calibrates, FixVariables(config.gnss)
         self.variables = variables if calibrates and variables.keys else None
         self.lever_arm_m = np.array(config.gnss.lever_arm_m)
         self._data = AidingData.empty()  # by the given offsets of time alone
@@ -96,6 +98,11 @@ class Aiding:
         self._shifted_s = 0.0  # added to the times of fixes that wait
         self._revised_ns = int(np.iinfo(np.int64).min) // 2  # never
         self.restart()
+
+    @property
+    def _has_use(self) -> bool:
+        """Whether fixes may tell the world; GTSAM's smoothers cannot go on in another unit."""
+        return self.used and (self._calibrates or self._scaled_camera is None)
 
     @property
     def _held(self) -> FloatArray:
@@ -323,7 +330,7 @@ class Aiding:
         Args:
             state: of the newest frame; None without one.
         """
-        if state is None or not self.used or not self._path.append(state):
+        if state is None or not self._has_use or not self._path.append(state):
             return None
         if self.aligned:  # for fixes that come late
             if state.stamp_ns - self._path.states[0].stamp_ns > 2 * _HISTORY_NS:
@@ -344,12 +351,15 @@ class Aiding:
             drifted = [pair.after_drift(*variances_of(state)) for pair in pairs if pair is not None]
             expected_s = -self.offset_s - offset_s
             offset = expected_s, sigma_s
-            found = align_world(drifted, now, self._level, offset, self._expected_arm())
+            unknown = self._expected_arm(), self._scaled_camera
+            found = align_world(drifted, now, self._level, offset, *unknown)
             if found is None:
                 return None
             offset_s += found.offset_s
         assert found is not None
-        if self._is_vague(found, round(offset_s * 1e9)):
+        offset_ns = round(offset_s * 1e9)
+        timed = [self._path.at(fix, offset_ns) for fix in self._fixes if fix.is_timed]
+        if found.is_vague([pair for pair in timed if pair is not None]):
             return None
         return replace(found, offset_s=offset_s)
 
@@ -360,26 +370,9 @@ class Aiding:
             return None
         return np.array(gnss.lever_arm_m) - self.lever_arm_m, gnss.lever_arm_sigma_m
 
-    def _is_vague(self, found: WorldAlignment, offset_ns: int) -> bool:
-        """Whether clock or lever arm are known so badly that they count beside the noise."""
-        gauge = len(found.covariance) + (found.offset_sigma_s > 0.0)
-        of_arm = np.diag(found.joint_covariance)[gauge:]
-        if found.offset_sigma_s == 0.0 and not len(of_arm):
-            return False
-        timed = [
-            pair for fix in self._fixes if fix.is_timed and (pair := self._path.at(fix, offset_ns))
-        ]
-        if not 0 < len(timed) < _MOST_VAGUE:
-            return False
-        speed = np.mean([np.linalg.norm(pair.velocity) for pair in timed])
-        sigma = np.sqrt(np.mean([np.trace(pair.fix.covariance) / 3.0 for pair in timed]))
-        arm_sigma = float(np.sqrt(of_arm.max(initial=0.0)))
-        return bool(max(found.offset_sigma_s * speed, arm_sigma) > _VAGUE * sigma)
-
     def settle(self, found: WorldAlignment) -> list[NavState]:
         """Go on in the world of the fixes; all states so far in that world, the newest last."""
-        states = in_moved_world(self._path.states, found.motion)
-        states = [with_unknown_gauge(state, found.covariance, found.centre) for state in states]
+        states = found.settled(self._path.states)
         self.aligned, self._fixes, self._path.states = True, [], list(states)
         self.found = found
         self.offset_s, self._offset_sigma_s = self.offset_s + found.offset_s, found.offset_sigma_s

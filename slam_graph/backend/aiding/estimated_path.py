@@ -11,7 +11,7 @@ import numpy as np
 
 from slam_graph.arrays import FloatArray
 from slam_graph.backend.aiding.fix_factors import Fix, PositionFix, pose_between
-from slam_graph.backend.aiding.world_alignment import PathFix
+from slam_graph.backend.aiding.path_of_fixes import PathFix
 from slam_graph.geometry import NavState
 
 

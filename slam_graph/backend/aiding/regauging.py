@@ -6,7 +6,8 @@ The prior ‖R δ - d‖² is relative to the first state. A world that is moved
 gauge moves all variables by N g, with N the directions that no image measures. So the prior of the
 moved variables is min over g of ‖R (δ - N g) - d‖² + ‖Γ^-½ g‖², by a QR whose columns begin with g.
 Lever arm and clock of the fixes, where they are variables, enter with it: Γ is then the joint
-covariance of the gauge and of them.
+covariance of the gauge and of them. Where images have not told the unit of length either, the
+window is first put in metres (`rescaling.py`), and the scale is one more direction.
 
 Later fixes move the world further. A step along straight tangents stretches what it turns, by half
 of the squared angle, which the dynamics contradict; so where steps are judged by the cost and
@@ -25,7 +26,9 @@ import numpy as np
 from gtsam.symbol_shorthand import X
 
 from slam_graph.arrays import FloatArray
+from slam_graph.backend.aiding.rescaling import rescaled
 from slam_graph.backend.aiding.world_alignment import WorldAlignment
+from slam_graph.backend.cost.unit_of_length import scale_direction
 from slam_graph.backend.initialization.segment_joint import moved, turned
 from slam_graph.backend.marginalization.landmark_store import LandmarkStore
 from slam_graph.backend.solve.square_root import Layout, SquareRootInformation, triangularize
@@ -54,15 +57,18 @@ def regauged(
             of the joint covariance.
         calibration: their values.
     """
-    motion, covariance, centre = found.motion, found.covariance, found.centre
-    there = moved(window, motion)
-    prior = there.prior
-    N = gauge_directions(there.state.first, prior.layout, centre, level=len(covariance) == 4)
+    covariance, centre, camera = found.covariance, found.centre, found.scaled_camera
+    there = moved(rescaled(window, found.scale, camera), found.motion)
+    prior, first = there.prior, there.state.first
+    N = gauge_directions(first, prior.layout, centre, level=len(covariance) == 4)
+    if camera is not None:
+        scaling = scale_direction(first, prior.layout, centre, camera.translation())
+        N = np.column_stack([N, scaling])
     store = LandmarkStore()
     store.open = window.lost_features.open
     if calibration is not None:
         covariance = found.joint_covariance
-        there.state.insert_calibration(calibration)
+        there.state.insert(calibration)
         there.state.freeze(keys)
     return replace(
         there,

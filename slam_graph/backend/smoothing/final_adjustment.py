@@ -109,7 +109,7 @@ class FinalBa:
     def of_worlds(
         log: FrameLog,
         causal: Trajectory,
-        worlds: Sequence[tuple[int, int | None, FloatArray]],
+        worlds: Sequence[tuple[int, int | None, FloatArray, bool]],
         rig: Rig,
         backend: BackendConfig,
         config: FinalBaConfig,
@@ -123,8 +123,9 @@ class FinalBa:
             log: all frames.
             causal: as for `adjust_recording`.
             worlds: times of the first and the last state of each part, in the order of time, None
-                for the end of the recording; and the covariance of its gauge in the world of the
-                first (4, 4) or (6, 6), m and rad. Frames before the first part belong to it.
+                for the end of the recording; the covariance of its gauge in the world of the
+                first (4, 4) or (6, 6), m and rad; whether it is in the world of fixes. Frames
+                before the first part belong to it.
             rig: as for `adjust_recording`.
             backend: noise and triangulation.
             config: settings.
@@ -133,15 +134,14 @@ class FinalBa:
             consistent: whether features that do not fit the causal trajectory are left out.
         """
         parts: list[FinalBa] = []
-        for number, (begin_ns, end_ns, unknown) in enumerate(worlds):
+        for number, (begin_ns, end_ns, unknown, of_fixes) in enumerate(worlds):
             inside = causal.stamps_ns >= begin_ns
             if end_ns is not None:
                 inside &= causal.stamps_ns <= end_ns
             offset_ns = round(rig.pose_offset_s * 1e9)
-            part = log.part(
-                None if number == 0 else begin_ns - offset_ns,
-                None if end_ns is None else end_ns - offset_ns,
-            )
+            first_ns = None if number == 0 else begin_ns - offset_ns
+            last_ns = None if end_ns is None else end_ns - offset_ns
+            part = log.part(first_ns, last_ns, of_fixes)
             try:
                 chosen = causal if inside.all() else causal.select(inside)
                 if consistent:
@@ -160,7 +160,7 @@ class FinalBa:
                 parts.append(replace(found, history=history, within=within))
         if len(parts) < 2:
             return parts[0] if parts else None
-        history = parts[0].history.like()
+        history = min((part.history for part in parts), key=lambda own: own.has_scale).like()
         for found in parts:
             history.extend(found.history)
         last = parts[-1]
@@ -258,7 +258,7 @@ def _smoothed(log: FrameLog, causal: Trajectory, task: SmoothingTask, report: Re
     if len(keyframes) > longest:
         task = replace(task, joint=False)
     level = task.rig.has_imu
-    history = StateHistory(level, task.rig.scaled_camera)
+    history = StateHistory(level, None if log.georeferenced else task.rig.scaled_camera)
     states: list[NavState] = []  # of the last segment, from its anchor on
     solved: list[AdjustedSegment] = []
     for first, stop in segments(len(keyframes), longest):

@@ -151,17 +151,19 @@ class FrameLog:
         self._frames.append(frame.stamp_ns)
         self._noise.extend(noise)
 
-    def part(self, begin_ns: int | None, end_ns: int | None) -> FrameLog:
+    def part(self, begin_ns: int | None, end_ns: int | None, of_fixes: bool = True) -> FrameLog:
         """The log of the frames from one time to another, on the clock of the cameras.
 
         Args:
             begin_ns: of the first frame; None for the beginning.
             end_ns: of the last frame; None for the end.
+            of_fixes: whether the estimate is in the world of fixes there, if it is anywhere.
         """
         stamps = self.frames_ns
         first = 0 if begin_ns is None else int(np.searchsorted(stamps, begin_ns))
         stop = len(stamps) if end_ns is None else int(np.searchsorted(stamps, end_ns, "right"))
         part = copy(self)
+        part.georeferenced &= of_fixes
         part._frames = self._frames[first:stop]
         part._noise = self._noise[2 * first : 2 * stop]
         inside = [k - first for k in self._keyframes if first <= k < stop]

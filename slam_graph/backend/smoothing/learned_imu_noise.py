@@ -28,7 +28,7 @@ from slam_graph.backend.smoothing.state_elimination import (
     ChainEquations,
     EliminatedStates,
 )
-from slam_graph.free_memory import give_back
+from slam_graph.kernels.free_memory import give_back
 from slam_graph.sensors import AidingData
 
 logger = logging.getLogger(__name__)

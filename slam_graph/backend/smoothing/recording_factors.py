@@ -260,7 +260,7 @@ class RecordingFactors:
 
     def _scale(self, values: gtsam.Values) -> list[gtsam.NonlinearFactor]:
         """What holds the scale where nothing measures it: how far away one keyframe is."""
-        if self._rig.has_scale:
+        if self._rig.has_scale or self._segment.aiding.absolute:
             return []
         centre = values.atPose3(X(self._anchor)).translation()
         poses = [values.atPose3(X(k)) for k in range(len(self._segment.keyframes))]

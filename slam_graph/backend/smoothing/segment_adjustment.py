@@ -14,7 +14,7 @@ from slam_graph.backend.smoothing.recording_problem import BundleAdjustment
 from slam_graph.backend.smoothing.smoothing_task import AdjustedSegment, SegmentStart, SmoothingTask
 from slam_graph.backend.smoothing.track_fusion import with_fused_features
 from slam_graph.errors import EstimationError
-from slam_graph.free_memory import give_back
+from slam_graph.kernels.free_memory import give_back
 
 logger = logging.getLogger(__name__)
 

@@ -258,8 +258,8 @@ class State:
             for table in tables
         )
 
-    def insert_calibration(self, values: gtsam.Values) -> None:
-        """Add parameters of the rig or of the position fixes."""
+    def insert(self, values: gtsam.Values) -> None:
+        """Add variables that are no features, such as parameters of rig or position fixes."""
         self._insert(values, values.keys())
 
     def _insert(self, values: gtsam.Values, keys: Iterable[int]) -> None:
