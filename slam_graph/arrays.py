@@ -35,8 +35,8 @@ class GrowingTable:
 
     One array that grows moves to a larger place again and again. Between what else is allocated
     meanwhile it leaves holes of its size, which stay in the memory of the process. All blocks but
-    the last are compressed, column by column: times and counts to a tenth and less, measurements,
-    whose last digits are noise, by a fifth.
+    the last are compressed, column by column: times and counts to 10 % of their size and less,
+    measurements, whose last digits are noise, to 80 %.
 
     Args:
         width: numbers in a row.

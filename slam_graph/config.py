@@ -81,10 +81,11 @@ class LimitsConfig(Settings):
     One that waits for its first state, or for another one before a segment has lasted for five
     seconds, is diagnosed after 5 s of the recording, again after 10, 20, … s, and at once after a
     loss. One whose estimate has lasted is diagnosed 24 s after its start, from 6 s on where images
-    contradict the IMU (after 12 s as well where the first diagnosis did not rule that out), at once
-    where its start had to be corrected, and while it waits after a loss, and is ended only if
-    calibration or units are so wrong that the estimate is worth nothing. Without it, or without
-    `backend.initialization.check_calibration`, the cause is looked for at the end."""
+    contradict the IMU or the algorithm cannot say so, as without an IMU (after 12 s as well where
+    the first diagnosis did not rule that out), at once where its start had to be corrected, and
+    while it waits after a loss, and is ended only if calibration or units are so wrong that the
+    estimate is worth nothing. Without it, or without `backend.initialization.check_calibration`,
+    the cause is looked for at the end."""
 
     max_speed: float = expert(default=100.0, gt=0)
     """Largest plausible speed, m/s."""

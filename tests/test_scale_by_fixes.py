@@ -23,6 +23,7 @@ from slam_graph.backend.posed_frame import PosedFrame
 from slam_graph.backend.solve.square_root import Layout
 from slam_graph.backend.solve.state import dims_of, imu_state_keys
 from slam_graph.backend.window import Window
+from slam_graph.datasets.faults.injection import inject
 from slam_graph.geometry import NavState
 from slam_graph.loop_closure import Keyframe, KeyframeLog
 from slam_graph.results import RunResult, SavedRun
@@ -246,7 +247,20 @@ def test_an_algorithm_of_several_steps_takes_the_scale_from_fixes() -> None:
     assert np.sqrt(np.mean(errors_m(result) ** 2)) < 0.08
 
 
-@pytest.mark.parametrize(("algorithm", "why"), [("msckf", "did not"), ("isam2", "smoothers")])
+def test_what_was_lost_before_fixes_told_the_world_stays_apart() -> None:
+    """Its unit of length is another one, and the rest has its fixes all the same."""
+    lost = inject(flight(duration_s=10.0), ["all_missing:at_s=3.5,duration_s=1.5"])
+    result = sg.run(lost, overrides=[BELIEVED, "min_coverage=0.1"])
+    first, second = result.segments
+    assert (first.of_fixes, second.of_fixes, second.joined_by) == (False, True, "none")
+    assert not result.georeferenced
+    assert not result.history.has_scale
+    assert result.final_ba is not None
+    smoothed = second.part_of(result.final_ba.trajectory)
+    assert sg.ape(result.groundtruth, smoothed, alignment="none").statistics.rmse < 0.05
+
+
+@pytest.mark.parametrize(("algorithm", "why"), [("msckf", "nothing told"), ("isam2", "smoothers")])
 def test_where_fixes_do_not_tell_the_scale_the_run_says_so(
     algorithm: str, why: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -60,7 +60,8 @@ class PosedFrame:
     def rescaled(self, scale: float, camera: gtsam.Pose3) -> PosedFrame:
         """The same where the path of the camera, at body_T_camera, has another unit of length."""
         pose = gtsam.Pose3(gtsam.Rot3(self.rotation), self.position)
-        return self.at(self.rescaled_pose(pose, scale, camera))
+        motion = self.motion and rescaled_motion(self.motion, scale, camera.translation())
+        return replace(self.at(self.rescaled_pose(pose, scale, camera)), motion=motion)
 
     @staticmethod
     def rescaled_pose(world_T_body: gtsam.Pose3, scale: float, camera: gtsam.Pose3) -> gtsam.Pose3:
@@ -124,3 +125,19 @@ def _motion(last: Sequence[tuple[int, gtsam.Pose3]], rig: Rig) -> FrameMotion | 
         rate = rate + 0.5 * seconds * change
         change[3:] += np.cross(rate[:3], rate[3:])  # of the velocity, not of its coordinates
     return FrameMotion(rate, rig.pose_offset_s, change)
+
+
+def rescaled_motion(motion: FrameMotion, scale: float, arm: FloatArray) -> FrameMotion:
+    """How the body moves while a frame is taken, its velocity in another unit of length.
+
+    Args:
+        motion: of the body.
+        scale: new units per old one.
+        arm: (3,) position in the body of the camera whose path is scaled, in the new unit.
+    """
+    rate, change, factor = motion.rate.copy(), motion.change.copy(), scale - 1.0
+    turning = np.cross(rate[:3], arm)
+    rate[3:] = scale * rate[3:] + factor * turning
+    towards = np.cross(change[:3], arm) + np.cross(rate[:3], turning)
+    change[3:] = scale * change[3:] + factor * towards
+    return replace(motion, rate=rate, change=change)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""Memory that is free, but that the C library keeps: no kernel, but a call of compiled code."""
+"""Memory that is free, but that the C library keeps, is given back to the system."""
 
 from __future__ import annotations
 

@@ -21,6 +21,7 @@ from slam_graph.pipeline.divergence import DivergenceError, check_sane
 from slam_graph.pipeline.recovery import Recovery
 from slam_graph.pipeline.stage import EstimatedFrame
 from slam_graph.pipeline.tracking import TrackedPacket
+from slam_graph.pipeline.world_of_fixes import usable_aiding
 from slam_graph.results import RunInput, RunResult
 
 _DIFFERENCE_NS = 25_000_000
@@ -245,7 +246,7 @@ class Estimation:
                 clock of the IMU has changed.
         """
         estimator, result = self.estimator, self._result
-        self._recovery.world_motion = None
+        self._recovery.world_motion, self._recovery.world_scale = None, 1.0
         if estimator.replayed is not None:
             self._recovery.supersede(estimator.replayed)
             self._note_calibration()
@@ -258,9 +259,8 @@ class Estimation:
             raise DivergenceError(estimator.clock_change.message)
 
     def _note_calibration(self) -> None:
-        """Note under which calibration, and in which world, the estimate has begun anew."""
+        """Note under which calibration the estimate has begun anew."""
         self._result.corrected_rig = self.estimator.corrected_rig
-        self._result.georeferenced = self.estimator.aiding.aligned
 
     def _note_fixes(self) -> None:
         """Note lever arm and clock of the position fixes as they are known now."""
@@ -287,8 +287,9 @@ class Estimation:
         if not estimator.initialized:
             self._start_from_known_state(time_ns)
         estimator.add_imu(tracked.packet.imu)
-        if tracked.packet.aiding is not None:
-            estimator.aiding.add(tracked.packet.aiding)
+        aiding = usable_aiding(tracked.packet.aiding, self._result.input)
+        if aiding is not None:
+            estimator.aiding.add(aiding)
         self._recovery.check_recorded(time_ns)
         with _solvable(f"frame {stamp_ns}"):
             state = estimator.add_frame(features)

@@ -69,8 +69,9 @@ class Recovery:
 
     def append(self, states: list[NavState]) -> None:
         """Note new states; the first after a start begins a segment."""
-        joint, result = self._estimator.joint, self._result
-        of_fixes = self._estimator.aiding.aligned
+        result = self._result
+        joined, of_fixes = self._world()
+        joint = self._estimator.joint if joined else None
         for state in states:
             if joint is None:
                 result.segments.add(state.stamp_ns, of_fixes=of_fixes)
@@ -81,8 +82,26 @@ class Recovery:
             self._recent.append(state)
             while self._recent[0].stamp_ns < state.stamp_ns - _REMEMBERED_NS:
                 self._recent.popleft()
-        measured = result.segments.all_of_fixes
-        result.history.scaled_camera = None if measured else result.input.rig.scaled_camera
+        self._note_unit()
+
+    def _world(self) -> tuple[bool, bool]:
+        """Whether the present segment continues the one before; whether fixes tell its world.
+
+        One whose world fixes tell does not continue one that was never in that world, where its
+        place, and perhaps its unit of length, are not known.
+        """
+        joint, of_fixes = self._estimator.joint, self._estimator.aiding.aligned
+        ended = [segment for segment in self._result.segments if segment.ended_by]
+        before = bool(ended) and ended[-1].of_fixes
+        if of_fixes and not before:
+            return False, True
+        return True, of_fixes or (before and joint is not None and joint.holds)
+
+    def _note_unit(self) -> None:
+        """Note whether fixes tell the unit of length of all segments."""
+        result = self._result
+        told = result.segments.all_of_fixes
+        result.history.scaled_camera = None if told else result.input.rig.scaled_camera
 
     def supersede(self, by: list[NavState]) -> None:
         """Forget the states of the present segment, as others come in their place.
@@ -146,7 +165,7 @@ class Recovery:
             DivergenceError: the same, if a new start has no prospect or is not wanted.
         """
         result, measured = self._result, not isinstance(lost, JumpError)
-        self.world_motion = None
+        self.world_motion, self.world_scale = None, 1.0
         change = self._estimator.find_clock_change() if measured else None
         if change is not None:
             lost = DivergenceError(change.message)
@@ -158,6 +177,7 @@ class Recovery:
         self._forget_bad_states(good_ns)
         before = self._recent[-1] if self._recent else None
         lasted_s = result.segments.end(good_ns, str(lost))
+        self._note_unit()
         end_ns = result.segments[-1].end_ns if len(result.segments) else None
         result.forget_states(None if end_ns is None else end_ns + 1)
         self._short = self._short + 1 if lasted_s < result.segments.SHORT_S else 0

@@ -29,6 +29,7 @@ class RunDoubts:
     def __init__(self, result: RunResult, diagnostics: Diagnostics) -> None:
         self._result, self._diagnostics = result, diagnostics
         self._estimated = self._at_limit = 0
+        self._before = 0, 0  # features that were tested and rejected before the present segment
         config = result.config
         self._has_imu = result.input.rig.has_imu
         self._learns = config.algorithm.engine == "square_root"
@@ -37,6 +38,7 @@ class RunDoubts:
     def forget(self) -> None:
         """Forget all frames, as the estimator begins anew."""
         self._estimated = self._at_limit = 0
+        self._before = self._result.logs.innovations.totals
 
     def add(self, frame: EstimatedFrame) -> None:
         """Take the next frame."""
@@ -51,19 +53,20 @@ class RunDoubts:
     @property
     def exist(self) -> bool:
         """Whether a warning or what the gate rejects makes an estimate doubtful."""
-        return self._rejects_much or any(self._diagnostics.counts[kind] for kind in _DOUBTS)
+        return self._rejects_much() or any(self._diagnostics.counts[kind] for kind in _DOUBTS)
 
     @property
     def imu_agrees(self) -> bool:
-        """Whether images agree with the IMU as in good runs, as far as the estimate would show it.
+        """Whether images agree with the IMU as in good runs, since the estimator last began.
 
-        It does where it learns the noise of the IMU.
+        Only an estimate that learns the noise of its IMU can say so.
         """
         share = self.noise_at_limit
         if share is None or not self._learns:
             return False
-        return share <= _MAX_AT_LIMIT and not self._rejects_much
+        return share <= _MAX_AT_LIMIT and not self._rejects_much(*self._before)
 
-    @property
-    def _rejects_much(self) -> bool:
-        return self._result.logs.innovations.rejected_share > _MAX_REJECTED
+    def _rejects_much(self, tested: int = 0, rejected: int = 0) -> bool:
+        """Whether too much is rejected of what came after some features."""
+        of_all, rejected_of_all = self._result.logs.innovations.totals
+        return rejected_of_all - rejected > _MAX_REJECTED * max(of_all - tested, 1)

@@ -23,6 +23,7 @@ from slam_graph.pipeline.stage import (
     Stage,
     warn_on_failure,
 )
+from slam_graph.pipeline.world_of_fixes import usable_aiding
 from slam_graph.results import RunResult
 from slam_graph.sensors import Rig
 
@@ -83,10 +84,10 @@ class Smoothing(Stage):
             return
         try:
             packet = frame.packet
-            self._log.add(packet.imu, frame.features, frame.imu_noise, packet.aiding)
+            aiding = usable_aiding(packet.aiding, self._result.input)
+            self._log.add(packet.imu, frame.features, frame.imu_noise, aiding)
             if frame.clock_changes is not None:
                 self._log.clock_changes = frame.clock_changes
-            self._log.georeferenced = frame.georeferenced
             self._log.fix_offset_s = frame.fix_offset_s
             self._log.fix_calibration = frame.fix_calibration
         except (OSError, SlamGraphError) as error:

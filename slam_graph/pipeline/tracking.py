@@ -23,7 +23,6 @@ from slam_graph.diagnostics import Diagnostics
 from slam_graph.frontend import Feedback, Frontend
 from slam_graph.pipeline.forked_call import CallInTurn, ForkedCall
 from slam_graph.pipeline.frame_watch import FrameWatch
-from slam_graph.pipeline.world_of_fixes import usable_aiding
 from slam_graph.results import RunInput
 from slam_graph.sensors import AidingData, CameraFrame, FeatureFrame, ImuData, Packet, Rig
 
@@ -228,7 +227,7 @@ def packets_of(sequence: Sequence, asked: RunInput) -> Iterator[Packet]:
         imu = packet.imu if asked.rig.has_imu else ImuData.empty()
         frame = _first_cameras(packet.frame, count)
         watch.look(frame)
-        yield Packet(imu, frame, usable_aiding(packet.aiding, asked))
+        yield Packet(imu, frame, packet.aiding)
 
 
 def _first_cameras(frame: CameraFrame | FeatureFrame, count: int) -> CameraFrame | FeatureFrame:

@@ -9,8 +9,8 @@ is `suspect`, whatever it has estimated. A run that does not start is diagnosed 
 one that goes on 6 and 24 s after its start, after 12 s where 6 s did not rule out what would ruin
 it, and at once where its start had to be corrected. After 24 s all frames are there that a
 diagnosis takes. Before that an estimate whose images agree with its IMU as in good runs is not
-diagnosed. The time offset between camera and IMU is watched over the whole run, as it may change
-later on.
+diagnosed, if it learns the noise of the IMU. The time offset between camera and IMU is watched over
+the whole run, as it may change later on.
 """
 
 from __future__ import annotations

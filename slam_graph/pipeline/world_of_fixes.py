@@ -19,8 +19,8 @@ NOT_FOR_SMOOTHERS = (
     "camera without an IMU or odometry are up to scale; use msckf, swf, okvis, ekf or iekf"
 )
 NOT_TOLD = (
-    "position fixes did not tell the scale of one camera without an IMU or odometry (too few, too "
-    "noisy, or along a straight line): all lengths are up to scale"
+    "nothing told the scale of one camera without an IMU or odometry in every segment (position "
+    "fixes are missing, too few, too noisy, or along a straight line): lengths are up to scale"
 )
 
 _LEAST_FIXES = 8
@@ -37,8 +37,13 @@ def usable_aiding(aiding: AidingData | None, asked: RunInput) -> AidingData | No
     """
     if aiding is None or asked.rig.has_scale:
         return aiding
-    own_engine = asked.config.algorithm.engine == "square_root"
-    return aiding.without_odometry() if own_engine else None
+    absolute = aiding.without_odometry() if _takes_scale(asked) else AidingData.empty()
+    return absolute if len(absolute) else None
+
+
+def _takes_scale(asked: RunInput) -> bool:
+    """Whether the engine can go on in another unit of length."""
+    return asked.config.algorithm.engine == "square_root"
 
 
 def why_no_scale(aiding: AidingData | None, asked: RunInput) -> str:
@@ -51,11 +56,14 @@ def why_no_scale(aiding: AidingData | None, asked: RunInput) -> str:
     backend, offset_ns = asked.config.backend, round(asked.rig.pose_offset_s * 1e9)
     if asked.rig.has_scale:
         return ""
-    known = AidingData.empty() if aiding is None else backend.on_the_clock(aiding)
-    known = known.within(asked.start_ns + offset_ns - 1, asked.end_ns + offset_ns)
+    if aiding is None:
+        return "" if _takes_scale(asked) else NO_SCALE
+    known = backend.on_the_clock(aiding).within(
+        asked.start_ns + offset_ns - 1, asked.end_ns + offset_ns
+    )
     if not len(known.without_odometry()):
         return NO_SCALE
-    return "" if usable_aiding(known, asked) is not None else NOT_FOR_SMOOTHERS
+    return "" if _takes_scale(asked) else NOT_FOR_SMOOTHERS
 
 
 def is_in_world_of_fixes(

@@ -102,9 +102,9 @@ class InnovationLog:
         self._tested, self._rejected = (int(columns[k].sum()) for k in ("tested", "rejected"))
 
     @property
-    def rejected_share(self) -> float:
-        """Rejected features as a part of those that were tested; 0 if none was."""
-        return self._rejected / max(self._tested, 1)
+    def totals(self) -> tuple[int, int]:
+        """How many features were tested, and how many of them rejected."""
+        return self._tested, self._rejected
 
     @property
     def stamps_ns(self) -> IntArray:

@@ -61,7 +61,6 @@ class RunResult(RunSummary):
         history: the causal estimate of every frame, with covariances.
         segments: stretches of it, each from a start to where the estimate was lost.
         start_was_given: whether the first state came with the data, in the world of the truth.
-        georeferenced: whether the world is that of the position fixes.
         fix_offset_s: added to the times of the fixes, beyond the given offset.
         fix_calibration: lever arm and clock of the fixes at the end, where they are estimated with
             the states.
@@ -86,7 +85,6 @@ class RunResult(RunSummary):
     history: StateHistory = field(default_factory=partial(StateHistory, compact=True))
     segments: Segments = field(default_factory=Segments)
     start_was_given: bool = False
-    georeferenced: bool = False
     fix_offset_s: float = 0.0
     fix_calibration: AidingData.Calibration | None = None
     corrected_rig: Rig | None = None
@@ -128,6 +126,11 @@ class RunResult(RunSummary):
             if part is not None:
                 part.forget_from(since_ns)
         self.logs.forget_states(since_ns)
+
+    @property
+    def georeferenced(self) -> bool:
+        """Whether the world is that of the position fixes, in all segments."""
+        return self.segments.all_of_fixes
 
     @property
     def config(self) -> RunConfig:

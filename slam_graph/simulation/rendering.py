@@ -242,8 +242,11 @@ def _pixels_of(camera: Camera) -> tuple[Grey, Grey, BoolArray]:
     sides = [np.linalg.norm(np.gradient(grid, axis=axis), axis=2) for axis in (0, 1)]
     focal_px = np.float32(0.5 * (camera.fx + camera.fy))
     stretch = (np.sqrt(sides[0] * sides[1]) * focal_px).ravel().astype(np.float32)
-    # it is 0 outside the field of view
-    return rays.astype(np.float32), np.maximum(stretch, np.float32(1e-3)), lit
+    stretch = np.maximum(stretch, np.float32(1e-3))  # it is 0 outside the field of view
+    found = rays.astype(np.float32), stretch, lit
+    for shared in found:
+        shared.setflags(write=False)
+    return found
 
 
 class _Hits:

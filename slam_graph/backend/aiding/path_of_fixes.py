@@ -35,14 +35,17 @@ _KEPT_SIGMA_M = 1e-3
 class PathFix:
     """A fix and the estimate at its time.
 
+    Lengths of the pose, its variances and its velocity are in the unit of the estimator's own
+    world.
+
     Attributes:
         fix: the measurement.
         pose: of the body then, in the estimator's own world.
         position_variance: of that pose, the sum of its axes, m².
         rotation_variance: the same of its orientation, rad².
         velocity: (3,) of the sensor there, m/s; zero if the time of the fix is known.
-        drift: variance per axis that the pose has gained since, m² or rad². Lengths of the pose,
-            its variances and its velocity are in the unit of the estimator's own world.
+        drift: variance that the pose has gained since, m² or rad², the sum of its axes, which is
+            taken for each of them.
     """
 
     fix: Fix

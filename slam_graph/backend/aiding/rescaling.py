@@ -19,9 +19,9 @@ import numpy as np
 from gtsam.symbol_shorthand import B, X
 
 from slam_graph.arrays import FloatArray
-from slam_graph.backend.posed_frame import PosedFrame
+from slam_graph.backend.posed_frame import PosedFrame, rescaled_motion
 from slam_graph.backend.solve.square_root import Layout, SquareRootInformation, triangularize
-from slam_graph.backend.solve.state import FrameMotion, State, dims_of, letter_and_index
+from slam_graph.backend.solve.state import State, dims_of, letter_and_index
 from slam_graph.backend.window import Window
 from slam_graph.geometry import NavState
 
@@ -57,7 +57,7 @@ def rescaled(window: Window, scale: float, camera: gtsam.Pose3 | None) -> Window
     there.insert_points(state.points.ids, scale * state.points.first)
     there.update(layout, offset)
     there.freeze(frozen)
-    there.motions = {i: _motion(motion, scale, arm) for i, motion in state.motions.items()}
+    there.motions = {i: rescaled_motion(motion, scale, arm) for i, motion in state.motions.items()}
     T = tangents(state.first, window.prior.layout, scale, arm)
     Rd = np.array(window.prior.Rd)
     Rd[:-1, :-1] = np.linalg.solve(T.T, window.prior.R.T).T
@@ -152,16 +152,6 @@ def _rates(states: list[NavState]) -> FloatArray:
     ]
     around: FloatArray = np.array([steps[0], *steps, steps[-1]])
     return 0.5 * (around[:-1] + around[1:])
-
-
-def _motion(motion: FrameMotion, scale: float, arm: FloatArray) -> FrameMotion:
-    """How the body moves while a frame is taken, its velocity in another unit."""
-    rate, change, factor = motion.rate.copy(), motion.change.copy(), scale - 1.0
-    turning = np.cross(rate[:3], arm)
-    rate[3:] = scale * rate[3:] + factor * turning
-    towards = np.cross(change[:3], arm) + np.cross(rate[:3], turning)
-    change[3:] = scale * change[3:] + factor * towards
-    return replace(motion, rate=rate, change=change)
 
 
 def _cross(vector: FloatArray) -> FloatArray:

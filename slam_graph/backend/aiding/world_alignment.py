@@ -133,7 +133,7 @@ def align_world(
     """The motion that brings a path to fixes of it; None as long as they do not tell it.
 
     Args:
-        pairs: N fixes with the path; the covariances are those of their differences.
+        pairs: N fixes with the path at their times.
         centre: (3,) the point, in the world of the estimate, about which the world turns.
         level: whether gravity is measured, so that the motion is one in position and yaw.
         offset: mean and standard deviation of what is to be added to the times of fixes with a

@@ -160,7 +160,7 @@ class StartCalibration:
         self._turns.add(frame, imu, self.mounted, _SPACING_NS)
         if self._waits(frame):
             return None
-        near = started and self._is_within(_NEAR_S)
+        near = started and self.mounted and self._is_within(_NEAR_S)
         self._next_ns = frame.stamp_ns + (_LATER_RETRY_NS if near else _RETRY_NS)
         covered = self._turns.covered(imu)
         self.done = self._turns.seen > _GIVE_UP_TURNS and self.mounted and started
@@ -215,7 +215,7 @@ class StartCalibration:
         self._refined_ns = frame.stamp_ns
         seen = self._static, self._camera, self._config.noise.pixel_sigma
         last, near_s = self._last, None
-        if last is not None and last.is_clear() and self._distance_s(last, _NEAR_SIGMAS) < _NEAR_S:
+        if last is not None and self._is_within(_NEAR_S):
             near_s = last.offset_s  # to confirm the calibration; all offsets are tried else
         found = align_by_epipolar_errors(*seen, imu, coarse, self.mounted, near_s)
         self._last = found
@@ -232,10 +232,10 @@ class StartCalibration:
         """
         if self._refined_ns is None:
             return False
-        pause_ns, last = _REFINED_NS, self._last
+        pause_ns = _REFINED_NS
         agrees = clear is None or self._distance_s(clear, -_FITS_SIGMAS) < 0.0
         agrees |= clear is not None and self._distance_s(clear, 0.0) < _ADOPTED_S
-        if self.mounted and started and agrees and last is not None and last.is_clear():
+        if self.mounted and started and agrees:
             if self._is_within(_SETTLED_S):
                 return True
             pause_ns = _SELDOM_NS if self._is_within(_NEAR_S) else pause_ns
@@ -244,7 +244,7 @@ class StartCalibration:
     def _is_within(self, distance_s: float) -> bool:
         """Whether the last estimate by epipolar errors is so near to the calibration."""
         last = self._last
-        if last is None or not (self.mounted and last.is_clear()):
+        if last is None or not last.is_clear():
             return False
         return self._distance_s(last, _NEAR_SIGMAS) < distance_s
 

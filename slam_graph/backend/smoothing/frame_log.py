@@ -163,7 +163,8 @@ class FrameLog:
         first = 0 if begin_ns is None else int(np.searchsorted(stamps, begin_ns))
         stop = len(stamps) if end_ns is None else int(np.searchsorted(stamps, end_ns, "right"))
         part = copy(self)
-        part.georeferenced &= of_fixes
+        part.georeferenced = of_fixes
+        part.__dict__.pop("aiding", None)  # that of the whole
         part._frames = self._frames[first:stop]
         part._noise = self._noise[2 * first : 2 * stop]
         inside = [k - first for k in self._keyframes if first <= k < stop]

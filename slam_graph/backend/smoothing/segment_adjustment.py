@@ -35,7 +35,7 @@ def adjust_segment(
     if task.config.fuse_features:
         try:
             fused, steps = with_fused_features(start, task, progress.fusing)
-            give_back()  # arrays of half the keyframes; those of all of them find no place in these
+            give_back()  # the arrays of the fusion are too small for what follows
 
             def report(step: int, passes: int) -> None:
                 progress.solving(steps + step, passes)
