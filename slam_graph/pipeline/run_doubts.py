@@ -14,8 +14,8 @@ _MAX_REJECTED = 0.05
 """The same for the share of features that the gate rejects. Of good recordings it is 2 to 4 %."""
 _MAX_AT_LIMIT = 0.05
 """Largest share of the frames in which the noise of the IMU is at its limit. Of good recordings it
-is 0 with two cameras, and nearly always with one; of those that a wrong set-up ruins it is 0.16 and
-more after 6 s, or the gate rejects 9 %."""
+is 0 with two cameras, and nearly always with one; of those that a wrong set-up ruins it is 0.06 to
+0.87 after 6 s, or the gate rejects more than `_MAX_REJECTED`, in 56 of 57."""
 
 
 class RunDoubts:

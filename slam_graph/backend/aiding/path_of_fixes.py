@@ -102,8 +102,8 @@ class WorldGuess:
             axes: (a, 3) of the turn.
         """
         turned = 3 + len(axes)
-        has_scale = len(delta) == turned + len(self.extra)
-        growth = 0.0 if has_scale else float(np.expm1(delta[turned]))
+        metric = len(delta) == turned + len(self.extra)
+        growth = 0.0 if metric else float(np.expm1(delta[turned]))
         turn = gtsam.Rot3.Expmap(axes.T @ delta[3:turned])
         # x -> turn (x - middle) + middle + shift
         shift = middle + delta[:3] - turn.rotate(middle)
