@@ -181,6 +181,22 @@ def test_imu_motion_follows_a_flight() -> None:
     assert motion.rotation(S, 3 * S) is None
 
 
+def test_the_rotation_over_seconds_without_images_is_known() -> None:
+    """Samples are kept since the oldest image whose features are looked for, up to a limit."""
+    flight, motion = Flight(), ImuMotion(ImuNoise(), 9.81)
+    for start_s in np.arange(0.0, 12.0, 0.5):
+        motion.add(flight.imu(start_s, start_s + 0.5), min(round(start_s * S), 2 * S))
+        assert (motion.rotation(2 * S, round((start_s + 0.5) * S)) is not None) == (start_s >= 2.0)
+    start, end = flight.nav_state(2.0).world_T_body, flight.nav_state(12.0).world_T_body
+    R = motion.rotation(2 * S, 12 * S)
+    assert R is not None
+    assert np.linalg.norm(R.logmap(start.rotation().between(end.rotation()))) < 1e-3
+    motion.add(flight.imu(12.0, 14.5), 2 * S)
+    assert motion.rotation(2 * S, round(14.5 * S)) is None
+    motion.add(flight.imu(14.5, 15.0))
+    assert motion.rotation(12 * S, 15 * S) is None
+
+
 @pytest.mark.parametrize("gravity", [9.81, 1.62])
 def test_imu_motion_is_the_prediction_of_the_back_end(gravity: float) -> None:
     """Both integrate alike, under the gravity of the settings."""

@@ -3,6 +3,7 @@
 """Laws of the front end on images whose motion is known exactly."""
 
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -39,7 +40,7 @@ from slam_graph.frontend.frontend_protocol import build_frontend
 from slam_graph.frontend.lucas_kanade import LucasKanade
 from slam_graph.sensors.camera import Camera
 from slam_graph.sensors.depth import DepthSensor
-from slam_graph.sensors.measurements import CameraFrame, FeatureFrame, FeatureObservations
+from slam_graph.sensors.measurements import CameraFrame, FeatureFrame, FeatureObservations, ImuData
 from slam_graph.sensors.rig import Rig, RigCamera
 
 
@@ -122,6 +123,28 @@ def test_points_that_move_on_their_own_are_rejected(texture: Spline) -> None:
     assert np.isin(outliers.ids, a.cameras[0].ids).all()
     assert not np.isin(outliers.ids, b.cameras[0].ids).any()
     assert np.max(np.abs(motion[:, 1])) < 1.5
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_no_feature_goes_on_in_another_place(texture: Spline, seed: int) -> None:
+    """What seems to is a chance match, and the IMU tells the motion better."""
+    images = [*(view(texture, shift(2.0 * k, k)) for k in range(3)), view(painted(seed + 10))]
+    kept: dict[bool, list[int]] = {}
+    for has_imu in (True, False):
+        frontend = build_frontend(replace(MONO, has_imu=has_imu), CONFIG)
+        frames = [
+            frontend.track(CameraFrame(k * 50_000_000, (image,)), resting((k - 1) * 50_000_000))
+            for k, image in enumerate(images)
+        ]
+        kept[has_imu] = [len(common(a.cameras[0], b.cameras[0])[0]) for a, b in pairwise(frames)]
+    assert min(kept[True][:2]) > 60
+    assert kept[True][2] == 0 < kept[False][2]
+
+
+def resting(start_ns: int) -> ImuData:
+    """Samples of 50 ms at rest."""
+    stamps = start_ns + np.arange(0, 55_000_000, 5_000_000)
+    return ImuData(stamps, np.zeros((11, 3)), np.tile([0.0, 0.0, 9.81], (11, 1)))
 
 
 def test_ids_are_unique_and_never_come_back(texture: Spline) -> None:

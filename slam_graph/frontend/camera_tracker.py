@@ -26,6 +26,10 @@ from slam_graph.kernels.ascending import are_among
 from slam_graph.kernels.spacing import apart
 from slam_graph.sensors import RigCamera
 
+_FEW, _FEW_SHARE = 15, 0.25
+"""If fewer features go on, and a smaller share of those that should be in the image, they are
+chance matches: seven wrong ones always fit an epipolar geometry, and a few more as well."""
+
 _MERGE_DISTANCE_PX = 3.0
 """Of two features closer than this the younger one is dropped: they track the same corner."""
 
@@ -44,6 +48,7 @@ class CameraTracker:
         rotation: takes the place of a gyroscope.
         moving: which features move by themselves; without it such are rejected.
         lost: finds corners again that were lost a few images ago.
+        keeps_few: whether the few features are kept that seem to go on where nearly all are lost.
 
     Attributes:
         outliers: the features that RANSAC, or the map of the back end, rejected in the last image.
@@ -61,7 +66,9 @@ class CameraTracker:
         rotation: ImageRotation | None = None,
         moving: MovingTracks | None = None,
         lost: LostFeatures | None = None,
+        keeps_few: bool = True,
     ) -> None:
+        self._keeps_few = keeps_few
         self._moving = moving or MovingTracks(wanted=False)
         self._camera = mounted.camera
         self._body_T_camera = mounted.body_T_camera
@@ -125,6 +132,7 @@ class CameraTracker:
                 self._stats.add("rejected_map", len(wrong))
                 inlier[wrong] = False
             self.outliers, after = after.select(~inlier), after.select(inlier)
+            after = self._without_few(after, int(np.count_nonzero(guess.trusted)))
         with self._stats.timed("temporal_ms"):
             after = self._recovered(before, after)
         alone = apart(np.ascontiguousarray(after.pixels), _MERGE_DISTANCE_PX)
@@ -213,6 +221,20 @@ class CameraTracker:
         self._associator.forget(ids)
         if self._lost is not None:
             self._lost.forget(ids)
+
+    def _without_few(self, after: Tracks, expected: int) -> Tracks:
+        """The features that go on, or none of them where nearly all are lost at once.
+
+        The IMU leads from one image to the next better than they do.
+
+        Args:
+            after: what seems to go on.
+            expected: how many should be in the image, by the gyroscope.
+        """
+        if self._keeps_few or len(after) >= min(_FEW, _FEW_SHARE * expected):
+            return after
+        self._stats.add("lost_suddenly", len(after))
+        return after.select(np.zeros(len(after), np.bool_))
 
     def _unrolled(self, tracks: Tracks) -> FloatArray:
         """Normalised coordinates (N, 2) of features as all rows would see them at one time."""

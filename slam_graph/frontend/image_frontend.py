@@ -56,9 +56,10 @@ class ImageFrontend:
     Attributes:
         frame_stats: of the last frame: counts of features (`tracked`, `new`, `recovered`, `stereo`,
             and those lost, by cause: `lost_klt`, `lost_fb`, `lost_match`, `lost_mask`,
-            `lost_merged`, `rejected_ransac`, `rejected_map`, `rejected_gate`, `rejected_new`,
-            `rejected_stereo`), and milliseconds per stage (`prepare_ms`, `temporal_ms`,
-            `ransac_ms`, `detect_ms`, `stereo_ms`). With depth also `with_depth` and `depth_ms`.
+            `lost_merged`, `lost_suddenly`, `rejected_ransac`, `rejected_map`, `rejected_gate`,
+            `rejected_new`, `rejected_stereo`), and milliseconds per stage (`prepare_ms`,
+            `temporal_ms`, `ransac_ms`, `detect_ms`, `stereo_ms`). With depth also `with_depth` and
+            `depth_ms`.
     """
 
     def __init__(
@@ -139,6 +140,7 @@ class ImageFrontend:
                     rotation,
                     self._moving if i == 0 else None,
                     lost,
+                    keeps_few=not rig.has_imu or config.method != "klt",
                 )
             )
         self._clahe = cv2.createCLAHE(CLAHE_CLIP_LIMIT, CLAHE_TILES)
@@ -165,7 +167,8 @@ class ImageFrontend:
         self._stats.add("rejected_gate", self._gated)
         self._gated = 0
         if imu is not None:
-            self._motion.add(imu)
+            seen_ns = [tracks.stamp_ns for tracks in self._tracks if len(tracks)]
+            self._motion.add(imu, min(seen_ns, default=None))
         with self._stats.timed("prepare_ms"):
             images = [self._equalize(image) for image in self._checked(frame)]
         first_new_id = self._next_id

@@ -19,7 +19,11 @@ from slam_graph.kernels.near_pairs import median_motions
 from slam_graph.sensors import ImuBuffer, ImuData, ImuNoise, RigCamera
 
 _HISTORY_NS = 2_000_000_000
-"""How long samples are kept; frames and states of the back end are never that far behind."""
+"""How long samples are kept; states of the back end are never that far behind."""
+
+_LONGEST_NS = 10_000_000_000
+"""The same for a camera that is without images for longer, and has its features from before then.
+"""
 
 _MAX_GAP_NS = 30_000_000
 """Samples must begin and end no further than this from the times asked for: some samples of a slow
@@ -44,10 +48,18 @@ class ImuMotion:
         self._imu = ImuBuffer()
         self._params = noise.preintegration_params(gravity)
 
-    def add(self, imu: ImuData) -> None:
-        """Add samples that follow those already given; others are left out."""
+    def add(self, imu: ImuData, since_ns: int | None = None) -> None:
+        """Add samples that follow those already given; others are left out.
+
+        Args:
+            imu: the samples.
+            since_ns: time of the oldest image whose features are still looked for; None for the
+                newest sample.
+        """
         self._imu.add(imu)
-        self._imu.forget_before(self._imu.newest_ns() - _HISTORY_NS)
+        newest_ns = self._imu.newest_ns()
+        oldest_ns = newest_ns if since_ns is None else min(since_ns, newest_ns)
+        self._imu.forget_before(max(oldest_ns - _HISTORY_NS, newest_ns - _LONGEST_NS))
 
     def rotation(self, start_ns: int, end_ns: int) -> gtsam.Rot3 | None:
         """start_R_end of the body, or None where samples are missing.
