@@ -23,8 +23,8 @@ from slam_graph.backend.initialization.clock_monitor import ClockMonitor
 from slam_graph.backend.initialization.gyro_alignment import (
     GyroAlignment,
     Turns,
-    _rotation_vectors,
     align_gyroscope,
+    rotation_vectors,
 )
 from slam_graph.backend.initialization.start_calibration import FoundCalibration, StartCalibration
 from slam_graph.backend.initialization.visual_rotation import visual_rotation
@@ -56,7 +56,7 @@ def test_rotation_vectors_are_those_of_scipy(size: float) -> None:
     axes = np.random.default_rng(2).normal(size=(2, 4, 3))
     vectors = size * axes / np.linalg.norm(axes, axis=-1, keepdims=True)
     R = Rotation.from_rotvec(vectors.reshape(-1, 3)).as_matrix().reshape(2, 4, 3, 3)
-    np.testing.assert_allclose(_rotation_vectors(R), vectors, rtol=0.0, atol=1e-13)
+    np.testing.assert_allclose(rotation_vectors(R), vectors, rtol=0.0, atol=1e-13)
 
 
 def test_visual_rotation_is_exact_without_noise() -> None:

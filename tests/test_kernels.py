@@ -30,8 +30,8 @@ from slam_graph.kernels.epipolar_pairs import (
     epipolar_moments,
     epipolar_moments_numpy,
 )
-from slam_graph.kernels.epipolar_rotation import _median, refine_rotation
-from slam_graph.kernels.epipolar_rotation_numpy import refine_rotation_numpy
+from slam_graph.kernels.epipolar_rotation import _median, find_directions, refine_rotation
+from slam_graph.kernels.epipolar_rotation_numpy import find_directions_numpy, refine_rotation_numpy
 from slam_graph.kernels.feature_elimination import (
     eliminate_features,
     eliminate_features_numpy,
@@ -51,6 +51,12 @@ from slam_graph.kernels.gate import (
     observation_rows_numpy,
     track_distances,
     track_distances_numpy,
+)
+from slam_graph.kernels.gyroscope_turns import (
+    orientations_at,
+    orientations_at_numpy,
+    turn_matrices,
+    turn_matrices_numpy,
 )
 from slam_graph.kernels.null_space import triangularize_features, triangularize_features_numpy
 from slam_graph.kernels.patch_search import (
@@ -474,6 +480,45 @@ def test_pair_equations() -> None:
         step = Rotation.from_rotvec(1e-6 * np.eye(3)[k]).as_matrix()
         numerical = (costs(R @ step) - costs(R @ step.T)) / 2e-6
         np.testing.assert_allclose(gradients[:, k], numerical, atol=0.05 * np.abs(gradients).max())
+
+
+def test_find_directions() -> None:
+    """Of bearings with noise and wrong matches; NaN of a pair without noise in some direction."""
+    rng = np.random.default_rng(13)
+    turn = Rotation.from_rotvec([0.1, -0.2, 0.05]).as_matrix()
+    points = rng.uniform([-2.0, -2.0, 2.0], [2.0, 2.0, 8.0], (40, 3))
+    both = points, (points - [0.24, 0.32, 0.0]) @ turn
+    first, second = (f / np.linalg.norm(f, axis=1, keepdims=True) for f in both)
+    first += rng.normal(0.0, 1e-4, first.shape)
+    second[:4] = second[4:8]
+    ahead = np.tile([0.0, 0.0, 1.0], (20, 1))
+    seen = np.concatenate([first, ahead]), np.concatenate([second, ahead])
+    variances = np.concatenate([np.full((40, 2), 1e-8), np.zeros((20, 2))])
+    pairs = np.array([0, 40, 60]), np.stack([turn, np.eye(3)])
+    found = np.empty((2, 2, 3))
+    for form, t in zip((find_directions, find_directions_numpy), found, strict=True):
+        form(*seen, variances, *pairs, t)
+        assert abs(t[0] @ [0.6, 0.8, 0.0]) > np.cos(5e-3)
+        assert np.isnan(t[1]).all()
+    np.testing.assert_allclose(abs(found[0, 0] @ found[1, 0]), 1.0, atol=1e-12)
+
+
+def test_gyroscope_turns() -> None:
+    """By a stretch of samples that are not evenly spaced, and beyond both of its ends."""
+    rng = np.random.default_rng(14)
+    times = np.sort(rng.uniform(0.0, 2.0, 200))
+    rates, chained = rng.normal(0.0, 2.0, (200, 3)), Rotation.random(200, rng).as_matrix()
+    at = np.concatenate([[-0.1, 2.1], times[:3], rng.uniform(0.0, 2.0, 300)])
+    ours, other = np.empty((2, len(at), 3, 3))
+    orientations_at(times, rates, chained, at, ours)
+    orientations_at_numpy(times, rates, chained, at, other)
+    np.testing.assert_allclose(ours, other, atol=1e-13)
+    lengths = np.concatenate([[0.0, 1e-9, 1e-5, 1.1e-4, np.pi, 6.0], rng.uniform(0.0, 4.0, 50)])
+    vectors = lengths[:, None] * Rotation.random(len(lengths), rng).as_matrix()[:, 0]
+    ours, other = np.empty((2, len(vectors), 3, 3))
+    turn_matrices(vectors, ours)
+    turn_matrices_numpy(vectors, other)
+    np.testing.assert_allclose(ours, other, atol=1e-14)
 
 
 @pytest.mark.parametrize("form", [refine_rotation, refine_rotation_numpy])

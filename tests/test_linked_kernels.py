@@ -27,16 +27,12 @@ _RESULTS = """
 import sys
 import numpy as np
 from slam_graph.kernels.epipolar import ray_depths
-from slam_graph.kernels.gate import observation_distances
+from slam_graph.kernels.null_space import triangularize_features
 rng = np.random.default_rng(0)
-root = np.asfortranarray(rng.normal(size=(9, 9)))
-distances = np.empty(50)
-observation_distances(
-    rng.normal(size=(50, 2)), rng.normal(size=(50, 2, 4)), root,
-    rng.integers(0, 9, (50, 4)), distances,
-)
+A, B = rng.normal(size=(50, 6, 3)), rng.normal(size=(50, 6, 4))
+triangularize_features(A, B)
 depths = ray_depths(np.eye(3), np.ones(3), rng.normal(size=(50, 2)), rng.normal(size=(50, 2)))
-print("numba" in sys.modules, distances.tobytes().hex(), depths.tobytes().hex())
+print("numba" in sys.modules, *(found.tobytes().hex() for found in (A, B, depths)))
 """
 
 _MODULES = """

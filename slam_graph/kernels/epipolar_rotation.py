@@ -3,8 +3,7 @@
 """Rotation between two frames from the bearings f₁, f₂ of their features, by Gauss-Newton.
 
 With the direction of the translation t, e = t · (f₁ × R f₂) is divided by its standard deviation.
-Its derivatives are by R ⊕ δ and by t ⊕ ε on the sphere. The NumPy form is in
-`epipolar_rotation_numpy.py`, with the papers.
+Its derivatives are by R ⊕ δ and by t ⊕ ε on the sphere. Papers: `epipolar_rotation_numpy.py`.
 """
 
 from __future__ import annotations
@@ -13,10 +12,10 @@ import math
 
 import numpy as np
 
-from slam_graph.arrays import FloatArray
+from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.kernels.compilation import compiled
 
-__all__ = ["refine_rotation"]
+__all__ = ["find_directions", "refine_rotation"]
 
 STEPS = 10
 """Most Gauss-Newton steps."""
@@ -150,17 +149,16 @@ def _find_direction(
     across: FloatArray,
     known: FloatArray,
     alike: bool,
+    damping: float,
 ) -> bool:
     """Fill what a rotation and weights make of the bearings; whether there is noise.
 
     These are the second bearings turned by R, (N, 3), the normals (N, 3) of the epipolar planes,
     the direction t, two unit vectors (2, 3) across it, and the information (2, 2) along these.
-    Where normals are to count alike, the weights are those that give them one length.
+    Where normals are to count alike, the weights are those that give them one length. `damping` is
+    a part of all noise, which is added in each direction.
     """
-    scatter, noise = np.empty((3, 3)), np.empty((3, 3))
-    for i in range(3):
-        for k in range(3):
-            scatter[i, k] = noise[i, k] = 0.0
+    scatter, noise = np.zeros((3, 3)), np.zeros((3, 3))
     total = sum_of_noise = 0.0
     for n in range(len(first)):
         for i in range(3):
@@ -183,7 +181,7 @@ def _find_direction(
                     of_second * first[n, i] * first[n, k] + of_first * turned[n, i] * turned[n, k]
                 )
     for i in range(3):
-        noise[i, i] += sum_of_noise
+        noise[i, i] += (1.0 + damping) * sum_of_noise
     least = _smallest(scatter, noise, t)
     if math.isnan(least):
         return False
@@ -207,6 +205,35 @@ def _find_direction(
                     value += across[a, i] * scatter[i, k] * across[b, k]
             known[a, b] = value * total * square + (WEAK if a == b else 0.0)
     return True
+
+
+@compiled()
+def _set_weights(
+    first: FloatArray,
+    variances: FloatArray,
+    turned: FloatArray,
+    normals: FloatArray,
+    t: FloatArray,
+    squares: FloatArray,
+    variance: FloatArray,
+    weights: FloatArray,
+) -> None:
+    """Fill squared residuals (N,) in units of the width, variances (N,), and weights over these."""
+    for n in range(len(first)):
+        e = of_first = of_second = 0.0
+        for i in range(3):
+            e += t[i] * normals[n, i]
+            of_first += t[i] * turned[n, i]
+            of_second += t[i] * first[n, i]
+        noise = variances[n, 0] * (1.0 - of_first * of_first)
+        noise += variances[n, 1] * (1.0 - of_second * of_second)
+        variance[n] = max(noise, TINY * TINY)
+        squares[n] = e * e / (CAUCHY_WIDTH * CAUCHY_WIDTH * variance[n])
+        weights[n] = squares[n]
+    # far from the solution all residuals are large, and none is an outlier
+    unit = max(1.0, _median(weights) / MEDIAN)
+    for n in range(len(first)):
+        weights[n] = 1.0 / (1.0 + squares[n] / unit) / variance[n]
 
 
 @compiled()
@@ -257,9 +284,7 @@ def _sum_up(
 ) -> None:
     """Fill H (5, 5) and, in its column 5, the gradient; `weights` over the variances."""
     row, back = np.empty(6), np.empty(3)
-    for i in range(5):
-        for k in range(6):
-            H[i, k] = 0.0
+    H[:] = 0.0
     for n in range(len(first)):
         x, y, z = first[n, 0], first[n, 1], first[n, 2]
         u, v, w = t[1] * z - t[2] * y, t[2] * x - t[0] * z, t[0] * y - t[1] * x
@@ -323,34 +348,19 @@ def refine_rotation(
     N = len(first)
     turned, normals, known = np.empty((N, 3)), np.empty((N, 3)), np.empty((2, 2))
     weights, squares, variance = np.empty(N), np.empty(N), np.empty(N)
-    t, across, H = np.empty(3), np.empty((2, 3)), np.empty((5, 6))
-    length = np.inf
+    t, across, H, length = np.empty(3), np.empty((2, 3)), np.empty((5, 6)), np.inf
     for step in range(-1 - REWEIGHTINGS, STEPS):
         # normals of one length first: those of wrong matches are the longest
         alike = step == -1 - REWEIGHTINGS
         if not alike:
-            for n in range(N):
-                e = of_first = of_second = 0.0
-                for i in range(3):
-                    e += t[i] * normals[n, i]
-                    of_first += t[i] * turned[n, i]
-                    of_second += t[i] * first[n, i]
-                noise = variances[n, 0] * (1.0 - of_first * of_first)
-                noise += variances[n, 1] * (1.0 - of_second * of_second)
-                variance[n] = max(noise, TINY * TINY)
-                squares[n] = e * e / (CAUCHY_WIDTH * CAUCHY_WIDTH * variance[n])
-                weights[n] = squares[n]
-            # far from the solution all residuals are large, and none is an outlier
-            unit = max(1.0, _median(weights) / MEDIAN)
-            for n in range(N):
-                weights[n] = 1.0 / (1.0 + squares[n] / unit) / variance[n]
+            _set_weights(first, variances, turned, normals, t, squares, variance, weights)
         if step >= 0:
             _sum_up(first, second, normals, R, t, across, weights, H)
             length = _step(H, R)
             for n in range(N):
                 weights[n] *= variance[n]
         if not _find_direction(
-            first, second, variances, weights, R, turned, normals, t, across, known, alike
+            first, second, variances, weights, R, turned, normals, t, across, known, alike, 0.0
         ):
             return np.inf
         if length < CONVERGED_RAD:
@@ -360,3 +370,31 @@ def refine_rotation(
     for n in range(N):
         cost += math.log1p(squares[n])
     return cost
+
+
+@compiled("void(f8[:, ::1], f8[:, ::1], f8[:, ::1], i8[::1], f8[:, :, ::1], f8[:, ::1])")
+def find_directions(
+    first: FloatArray,
+    second: FloatArray,
+    variances: FloatArray,
+    begins: IntArray,
+    R: FloatArray,
+    t: FloatArray,
+) -> None:
+    """Fill directions t (P, 3) of unit length for the rotations R of P pairs; NaN if there is none.
+
+    The arguments are those of `pair_equations`.
+    """
+    across, known = np.empty((2, 3)), np.empty((2, 2))
+    for p in range(len(R)):
+        rows, N = slice(begins[p], begins[p + 1]), begins[p + 1] - begins[p]
+        f, g, noises = first[rows], second[rows], variances[rows]
+        turned, normals = np.empty((N, 3)), np.empty((N, 3))
+        weights, squares, variance = np.empty(N), np.empty(N), np.empty(N)
+        for k in range(REWEIGHTINGS + 1):
+            if k > 0:
+                _set_weights(f, noises, turned, normals, t[p], squares, variance, weights)
+            if not _find_direction(
+                f, g, noises, weights, R[p], turned, normals, t[p], across, known, k == 0, TINY
+            ):
+                t[p] = np.nan

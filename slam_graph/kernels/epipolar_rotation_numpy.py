@@ -10,7 +10,7 @@ import numpy as np
 from scipy.linalg import lapack
 from scipy.spatial.transform import Rotation
 
-from slam_graph.arrays import FloatArray, median, skew
+from slam_graph.arrays import FloatArray, IntArray, median, skew
 from slam_graph.kernels.epipolar_rotation import (
     CAUCHY_WIDTH,
     CONVERGED_RAD,
@@ -24,7 +24,7 @@ from slam_graph.kernels.epipolar_rotation import (
     WEAK,
 )
 
-__all__ = ["refine_rotation_numpy"]
+__all__ = ["find_directions_numpy", "refine_rotation_numpy"]
 
 _NEXT, _LAST = [1, 2, 0], [2, 0, 1]
 """The axes after each axis, and before it."""
@@ -45,19 +45,31 @@ def refine_rotation_numpy(
     return cost
 
 
+def find_directions_numpy(
+    first: FloatArray,
+    second: FloatArray,
+    variances: FloatArray,
+    begins: IntArray,
+    R: FloatArray,
+    t: FloatArray,
+) -> None:
+    """`find_directions` in NumPy."""
+    for p in range(len(R)):
+        rows = slice(int(begins[p]), int(begins[p + 1]))
+        pair = _Pair(first[rows], second[rows], variances[rows], R[p])
+        try:
+            t[p] = pair.first_direction(TINY)
+        except np.linalg.LinAlgError:
+            t[p] = np.nan
+
+
 def _refined(
     first: FloatArray, second: FloatArray, variances: FloatArray, R: FloatArray
 ) -> tuple[float, FloatArray, FloatArray]:
     """Robust cost, rotation and information from a start R."""
     pair = _Pair(first, second, variances, R)
-    # normals of one length first: those of wrong matches are the longest
-    weights = 1.0 / np.maximum(np.sum(pair.normals**2, axis=0), TINY)
-    t, of_t = pair.direction(weights)
-    for _ in range(REWEIGHTINGS):
-        e, sigma = pair.residuals(t)
-        weights = _weights((e / (CAUCHY_WIDTH * sigma)) ** 2)
-        t, of_t = pair.direction(weights / sigma**2)
-    H, cost = np.zeros((5, 5)), np.inf
+    t = pair.first_direction()
+    H, of_t, cost = np.zeros((5, 5)), np.eye(2), np.inf
     for _ in range(STEPS):
         e, sigma = pair.residuals(t)
         squares = (e / (CAUCHY_WIDTH * sigma)) ** 2
@@ -116,7 +128,21 @@ class _Pair:
         self._R, self._turned = R, R @ self._second
         self.normals = _cross(self._first, self._turned)
 
-    def direction(self, weights: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def first_direction(self, damping: float = 0.0) -> FloatArray:
+        """The direction (3,) by normals of one length, found again without wrong matches.
+
+        Arguments and errors are those of `direction`.
+        """
+        # normals of one length first: those of wrong matches are the longest
+        weights = 1.0 / np.maximum(np.sum(self.normals**2, axis=0), TINY)
+        t, _ = self.direction(weights, damping)
+        for _ in range(REWEIGHTINGS):
+            e, sigma = self.residuals(t)
+            weights = _weights((e / (CAUCHY_WIDTH * sigma)) ** 2)
+            t, _ = self.direction(weights / sigma**2, damping)
+        return t
+
+    def direction(self, weights: FloatArray, damping: float = 0.0) -> tuple[FloatArray, FloatArray]:
         """The direction (3,) most orthogonal to the normals, and its information (2, 2).
 
         Both relative to what noise adds to the normals (Kanatani 1996, renormalization): where the
@@ -124,6 +150,7 @@ class _Pair:
 
         Args:
             weights: (N,).
+            damping: part of all noise that is added in each direction.
 
         Raises:
             numpy.linalg.LinAlgError: if there is no noise in some direction.
@@ -131,7 +158,7 @@ class _Pair:
         first, turned = self._first, self._turned
         scatter = (self.normals * weights) @ self.normals.T
         of_first, of_second = noises = weights * self._variances
-        noise = float(noises.sum()) * np.eye(3)
+        noise = (1.0 + damping) * float(noises.sum()) * np.eye(3)
         noise -= (first * of_second) @ first.T + (turned * of_first) @ turned.T
         values, vectors, info = lapack.dsygv(scatter, noise)
         if info != 0:

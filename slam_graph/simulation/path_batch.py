@@ -128,17 +128,18 @@ class PathBatch:
             )
         )
         cauchy = gtsam.noiseModel.mEstimator.Cauchy.Create(_CAUCHY_WIDTH)
-        position = gtsam.noiseModel.Robust.Create(
+        of_position = gtsam.noiseModel.Robust.Create(
             cauchy, gtsam.noiseModel.Isotropic.Sigma(3, _POSITION_SIGMA_M)
         )
-        rotation = gtsam.noiseModel.Isotropic.Sigma(3, _ROTATION_SIGMA_RAD)
-        turned = (Rotation.from_quat(self.truth.quaternions) * offset.inv()).as_matrix()
-        for row, state in self._measured:
-            delay_s = self._state_times()[state] - self._truth_times()[row]
-            velocity = self._start.atVector(V(state))
-            there = self.truth.positions[row] + velocity * delay_s
-            graph.add(gtsam.PoseTranslationPrior3D(X(state), there, position))
-            graph.add(gtsam.PoseRotationPrior3D(X(state), gtsam.Rot3(turned[row]), rotation))
+        of_rotation = gtsam.noiseModel.Isotropic.Sigma(3, _ROTATION_SIGMA_RAD)
+        rows, states = (np.array(column) for column in zip(*self._measured, strict=True))
+        turned = (Rotation.from_quat(self.truth.quaternions[rows]) * offset.inv()).as_matrix()
+        delays = self._state_times()[states] - self._truth_times()[rows]
+        velocities = np.array([self._start.atVector(V(state)) for state in states])
+        there = self.truth.positions[rows] + velocities * delays[:, None]
+        for state, position, R in zip(states.tolist(), there, turned, strict=True):
+            graph.add(gtsam.PoseTranslationPrior3D(X(state), position, of_position))
+            graph.add(gtsam.PoseRotationPrior3D(X(state), gtsam.Rot3(R), of_rotation))
         parameters = gtsam.GaussNewtonParams()
         parameters.setMaxIterations(_ITERATIONS)
         parameters.setRelativeErrorTol(1e-4)

@@ -21,17 +21,19 @@ from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from slam_graph.arrays import FloatArray, IntArray, median
 from slam_graph.backend.initialization.gyro_alignment import (
     MAX_OFFSET_S,
     GyroAlignment,
     IntegratedGyroscope,
+    rotation_matrices,
+    rotation_vectors,
 )
 from slam_graph.backend.initialization.visual_rotation import Bearings
 from slam_graph.backend.initialization.visual_turns import at_middle_row
 from slam_graph.kernels.epipolar_equations import CAUCHY_WIDTH, pair_equations
+from slam_graph.kernels.epipolar_rotation import find_directions
 from slam_graph.sensors import FeatureFrame, ImuBuffer, ImuData, RigCamera
 
 _SPACING_NS, _LONGEST_NS = 190_000_000, 410_000_000
@@ -54,8 +56,6 @@ _LEAST_VARIANCE = 0.25
 of the gyroscope and of the calibration, as of a mounting that is some degrees off."""
 _MEDIAN_CHI2_1 = 0.455
 """Median of χ² with one degree of freedom."""
-_REWEIGHTINGS = 3
-"""How often a first direction is found again without wrong matches."""
 _TURNS_AWAY = 0.12 * np.vstack([np.zeros((1, 3)), np.eye(3), -np.eye(3)])
 """Turns from a coarse mounting from which the mounting is sought, rad: there are local minima."""
 _SHORTENED = np.array([0.03, 0.15, 0.15, 0.15, 0.15, 0.15, 0.15])
@@ -77,7 +77,7 @@ class _Guess:
 
     def moved(self, by: FloatArray) -> _Guess:
         """With a change (7,); the mounting turns in the frame of the camera."""
-        turn = Rotation.from_rotvec(by[4:]).as_matrix()
+        turn = rotation_matrices(by[4:])
         return _Guess(self.offset_s + float(by[0]), self.bias + by[1:4], self.body_R_camera @ turn)
 
 
@@ -122,11 +122,8 @@ class _Problem:
             for a, b, i, j in pairs
         ]
         self._variances = np.maximum(np.concatenate(sigmas), _LEAST_SIGMA_RAD) ** 2
-        self._sizes = np.array([len(i) for _, _, i, _ in pairs])
-        self._begins = np.append(0, np.cumsum(self._sizes)).astype(np.int64)
-        rows = self._begins[:-1, None] + np.arange(self._sizes.max())
-        # (P, M) rows of each pair; behind them the number of all rows
-        self._rows = np.where(rows < self._begins[1:, None], rows, self._begins[-1])
+        sizes = [len(i) for _, _, i, _ in pairs]
+        self._begins = np.append(0, np.cumsum(sizes)).astype(np.int64)
         self._gyro = IntegratedGyroscope(imu)
         stamps = np.array([[frames[a][0] for a, *_ in pairs], [frames[b][0] for _, b, *_ in pairs]])
         self._t = 1e-9 * (stamps - self._gyro.start_ns)
@@ -143,14 +140,16 @@ class _Problem:
         times, C = self._t + at.offset_s, at.body_R_camera
         one, two = self._gyro.orientation(times)
         body = one.transpose(0, 2, 1) @ two
-        half = Rotation.from_matrix(body).as_rotvec() * -0.5
-        half = Rotation.from_rotvec(half).as_matrix()
-        by_bias = -half * self._seconds[:, None, None]
-        body = body @ Rotation.from_rotvec(by_bias @ at.bias).as_matrix()
+        by_bias = rotation_matrices(-0.5 * rotation_vectors(body))
+        by_bias *= -self._seconds[:, None, None]
+        body = body @ rotation_matrices(by_bias @ at.bias)
         R = np.ascontiguousarray(C.T @ body @ C)
-        t = self._directions(R) if t is None else t.copy()
-        found, squares = np.empty((self.count, 3, 4)), np.empty(len(self._first))
         seen = self._first, self._second, self._variances, self._begins
+        if t is None:
+            find_directions(*seen, R, t := np.empty((self.count, 3)))
+        else:
+            t = t.copy()
+        found, squares = np.empty((self.count, 3, 4)), np.empty(len(self._first))
         pair_equations(*seen, R, t, found, squares)
         cost = 0.5 * CAUCHY_WIDTH**2 * float(np.sum(np.log1p(squares)))
         # without the error of the rotation by the gyroscope, which is eliminated
@@ -167,49 +166,6 @@ class _Problem:
         g[_BIAS] += self._prior[_BIAS] * at.bias
         cost += 0.5 * self._prior[1] * float(at.bias @ at.bias)
         return _Equations(cost, H, g, t, squares)
-
-    def _directions(self, R: FloatArray) -> FloatArray:
-        """Directions (P, 3) along which normals of epipolar planes have no more than their noise.
-
-        Args:
-            R: (P, 3, 3) first_R_second.
-        """
-        turned = (np.repeat(R, self._sizes, axis=0) @ self._second[:, :, None])[:, :, 0]
-        normals = np.cross(self._first, turned)
-        # normals of one length first: those of wrong matches are the longest
-        weights = 1.0 / np.maximum(np.sum(normals**2, axis=1), _TINY)
-        t = np.empty((self.count, 3))
-        for rounds_left in reversed(range(_REWEIGHTINGS + 1)):
-            noise = -self._moments(self._first, weights * self._variances[:, 1])
-            noise -= self._moments(turned, weights * self._variances[:, 0])
-            total = np.add.reduceat(weights * self._variances.sum(axis=1), self._begins[:-1])
-            noise += (total[:, None, None] + _TINY * total.max()) * np.eye(3)
-            white = np.linalg.inv(np.linalg.cholesky(noise))
-            moments = white @ self._moments(normals, weights) @ white.transpose(0, 2, 1)
-            t = (white.transpose(0, 2, 1) @ np.linalg.eigh(moments)[1][:, :, :1])[:, :, 0]
-            t /= np.linalg.norm(t, axis=1, keepdims=True)
-            if rounds_left:
-                weights = self._weights(np.repeat(t, self._sizes, axis=0), turned, normals)
-        return np.ascontiguousarray(t)
-
-    def _moments(self, vectors: FloatArray, weights: FloatArray) -> FloatArray:
-        """Weighted second moments (P, 3, 3) of vectors (N, 3)."""
-        products = vectors[:, :, None] * (weights[:, None] * vectors)[:, None]
-        return np.asarray(np.add.reduceat(products, self._begins[:-1], axis=0))
-
-    def _weights(self, t: FloatArray, turned: FloatArray, normals: FloatArray) -> FloatArray:
-        """Weights (N,) of the features by their residuals; far from the solution none is wrong."""
-        sines = (
-            1.0
-            - np.column_stack([np.sum(t * turned, axis=1), np.sum(t * self._first, axis=1)]) ** 2
-        )
-        variance = np.maximum(np.sum(self._variances * sines, axis=1), _TINY**2)
-        squares = np.sum(normals * t, axis=1) ** 2 / (CAUCHY_WIDTH**2 * variance)
-        ascending = np.sort(np.append(squares, np.inf).take(self._rows), axis=1)
-        middle = np.stack([(self._sizes - 1) // 2, self._sizes // 2], axis=1)
-        medians = np.mean(np.take_along_axis(ascending, middle, axis=1), axis=1)
-        units = np.maximum(1.0, medians * CAUCHY_WIDTH**2 / _MEDIAN_CHI2_1)
-        return np.asarray(1.0 / ((1.0 + squares / np.repeat(units, self._sizes)) * variance))
 
     def minimized(
         self, at: _Guess, columns: list[int], steps: int = _STEPS, t: FloatArray | None = None

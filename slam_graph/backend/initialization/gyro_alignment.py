@@ -21,6 +21,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from slam_graph.arrays import BoolArray, FloatArray, IntArray, median, skew
+from slam_graph.kernels.gyroscope_turns import orientations_at, turn_matrices
 from slam_graph.sensors import ImuData
 
 MAX_OFFSET_S = 0.12
@@ -110,18 +111,16 @@ class IntegratedGyroscope:
 
     def __init__(self, imu: ImuData) -> None:
         self.start_ns = int(imu.stamps_ns[0])
-        self._t = (imu.stamps_ns - self.start_ns) * 1e-9
-        self._rate = imu.gyro
+        self._t = np.asarray((imu.stamps_ns - self.start_ns) * 1e-9, np.float64)
+        self._rate = np.ascontiguousarray(imu.gyro)
         mean = 0.5 * (imu.gyro[1:] + imu.gyro[:-1])
-        steps = Rotation.from_rotvec(mean * np.diff(self._t)[:, None]).as_matrix()
-        self._R = imu.chained(steps)
+        self._R = imu.chained(rotation_matrices(mean * np.diff(self._t)[:, None]))
 
     def orientation(self, t: FloatArray) -> FloatArray:
         """start_R_body (..., 3, 3) at times (...) in seconds after the start."""
-        row = np.clip(np.searchsorted(self._t, t, side="right") - 1, 0, len(self._t) - 1)
-        turn = 0.5 * (self._rate[row] + self.rate(t)) * (t - self._t[row])[..., None]
-        step = Rotation.from_rotvec(turn.reshape(-1, 3)).as_matrix().reshape(*t.shape, 3, 3)
-        return np.asarray(self._R[row] @ step)
+        R = np.empty((t.size, 3, 3))
+        orientations_at(self._t, self._rate, self._R, np.ascontiguousarray(t).ravel(), R)
+        return R.reshape(*t.shape, 3, 3)
 
     def rate(self, t: FloatArray) -> FloatArray:
         """Angular rates (..., 3) at times (...) in seconds after the start."""
@@ -149,7 +148,7 @@ class _Problem:
     def body_turns(self, offsets: FloatArray) -> FloatArray:
         """Rotation vectors (D, K, 3) of the body between the frames, for D offsets."""
         one, two = (self._gyro.orientation(t + offsets[:, None]) for t in self._t)
-        return _rotation_vectors(one.swapaxes(-1, -2) @ two)
+        return rotation_vectors(one.swapaxes(-1, -2) @ two)
 
     def rotation_by_wahba(self, body: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Mounting (D, 3, 3) and squared residual (D,) for rotation vectors (D, K, 3) of the body.
@@ -177,10 +176,9 @@ class _Problem:
             C: (3, 3) mounting.
             free: whether it is estimated as well.
         """
-        half = Rotation.from_rotvec(-0.5 * body.reshape(-1, 3)).as_matrix()
-        half = half.reshape(*body.shape, 3)
+        half = rotation_matrices(-0.5 * body)
         seen = C @ self._turns.R @ C.T
-        r = -_rotation_vectors(half @ (half @ seen))
+        r = -rotation_vectors(half @ (half @ seen))
         J = -half * self._seconds[:, None, None]
         if free:  # C exp(θ) turns the vectors by θ × v
             vectors = Rotation.from_matrix(self._turns.R).as_rotvec()
@@ -190,7 +188,14 @@ class _Problem:
         return (root @ r[..., None])[..., 0], root @ J
 
 
-def _rotation_vectors(R: FloatArray) -> FloatArray:
+def rotation_matrices(vectors: FloatArray) -> FloatArray:
+    """Rotations (..., 3, 3) of rotation vectors (..., 3), rad."""
+    R = np.empty((vectors.size // 3, 3, 3))
+    turn_matrices(np.ascontiguousarray(vectors).reshape(-1, 3), R)
+    return R.reshape(*vectors.shape, 3)
+
+
+def rotation_vectors(R: FloatArray) -> FloatArray:
     """Rotation vectors (..., 3), rad, of rotations (..., 3, 3) by less than half a turn.
 
     By way of SciPy's quaternions it takes ten times as long.
