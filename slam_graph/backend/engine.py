@@ -12,6 +12,7 @@ import numpy as np
 
 from slam_graph.arrays import FloatArray, IntArray
 from slam_graph.backend.aiding.regauging import LEAST_GAIN, left_of_gauge, moved_by_gauge
+from slam_graph.backend.aiding.world_linearization import moved_with_world
 from slam_graph.backend.cost.construction import ConstructedCost, CostConstruction
 from slam_graph.backend.cost.cost import Cost
 from slam_graph.backend.cost.track_drift import add_drift_noise
@@ -19,6 +20,7 @@ from slam_graph.backend.engine_protocol import EngineContext, StepReport
 from slam_graph.backend.marginalization.marginalize import marginalize_step
 from slam_graph.backend.solve.gauss_newton import Minimum, minimize
 from slam_graph.backend.solve.square_root import SquareRootInformation
+from slam_graph.backend.solve.state import State
 from slam_graph.backend.window import Window
 from slam_graph.backend.window_graph import WindowGraph, window_graph
 from slam_graph.geometry import NavState
@@ -41,6 +43,8 @@ class SquareRootEngine:
         )
         self._posterior: SquareRootInformation | None = None
         self._cost: Cost | None = None
+        self._before: State | None = None  # the last step
+        self._is_linear = True  # that step, along straight tangents
 
     def step(
         self,
@@ -66,6 +70,7 @@ class SquareRootEngine:
             constructed, minimum = self._minimize(window, constructed)
             self._construction.reject_residuals(window, constructed)
             self._describe(window, constructed, minimum, report)
+        self._before, self._is_linear = window.state, len(minimum.costs) == 2
         with report.timed("marginalization"):
             marginalize_step(window, constructed, minimum, self._policies)
         self._posterior, self._cost = minimum.posterior, constructed.cost
@@ -102,7 +107,16 @@ class SquareRootEngine:
         """The posterior of the last step, or what the start left behind."""
         return self._posterior or window.prior
 
-    def regauged(self, window: Window, level: bool) -> tuple[Window, gtsam.Pose3] | None:
+    def regauged(self, window: Window, level: bool) -> tuple[Window, gtsam.Pose3 | None]:
+        """The window in the world where the cost of the last step is least, linearised there."""
+        found = self._moved(window, level)
+        window, motion = (window, None) if found is None else found
+        if self._before is not None and self._policies.marginalization.first_estimates:
+            camera = self._context.rig.scaled_camera
+            window = moved_with_world(window, self._before, level, camera, self._is_linear)
+        return window, motion
+
+    def _moved(self, window: Window, level: bool) -> tuple[Window, gtsam.Pose3] | None:
         """The window in the world where the cost of the last step is least, and the motion."""
         posterior = self._posterior
         if posterior is None or posterior.d @ posterior.d < LEAST_GAIN:

@@ -174,15 +174,15 @@ class Engine(Protocol):
         """What the last step knew of the variables, the calibration among them."""
         ...
 
-    def regauged(self, window: Window, level: bool) -> tuple[Window, gtsam.Pose3] | None:
-        """The window in the world where the cost of the last step is least.
+    def regauged(self, window: Window, level: bool) -> tuple[Window, gtsam.Pose3 | None]:
+        """The window in the world where the cost of the last step is least, linearised there.
 
         Args:
             window: after the step.
             level: whether gravity is measured, so that the world turns about the vertical only.
 
         Returns:
-            With the motion new_T_old of the worlds; None if there is nothing to gain.
+            With the motion new_T_old of the worlds; None if estimates stay.
         """
         ...
 

@@ -387,11 +387,8 @@ class Estimator(EstimatorKnowledge):
         """The state, moved with its world as far as fixes ask for it and the steps did not."""
         if state is None or not self.aiding.aligned:
             return state
-        found = self._engine.regauged(window, self.rig.has_imu)
-        if found is not None:
-            self.window, motion = found
-            state = self.aiding.in_moved_world(state, motion)
-        return state
+        self.window, motion = self._engine.regauged(window, self.rig.has_imu)
+        return state if motion is None else self.aiding.in_moved_world(state, motion)
 
     def exclude(self, ids: IntArray) -> None:
         """Do not use features (N,) any more: they move. What is in the prior of them stays."""

@@ -115,8 +115,7 @@ def moved_by_gauge(
         The window, the posterior there, and the motion new_T_old.
     """
     level, centre = len(g) == 4, window.state.frames.atPose3(X(window.frame)).translation()
-    turn = gtsam.Rot3.Expmap(turned_axes(level).T @ g[3:])
-    motion = gtsam.Pose3(turn, centre + g[:3] - turn.rotate(centre))
+    motion = gauge_motion(g, centre, level)
     there = moved(window, motion)
 
     def shifted(information: SquareRootInformation) -> SquareRootInformation:
@@ -127,7 +126,20 @@ def moved_by_gauge(
     store = LandmarkStore()
     store.open = window.lost_features.open
     there = replace(there, prior=shifted(there.prior), lost_features=store)
-    return there, shifted(turned(known, turn.matrix())), motion
+    return there, shifted(turned(known, motion.rotation().matrix())), motion
+
+
+def gauge_motion(g: FloatArray, centre: FloatArray, level: bool) -> gtsam.Pose3:
+    """The motion new_T_old of a world that shifts and turns about a point.
+
+    Args:
+        g: (4 or more,) shift (m) and turn (rad); what follows is not used.
+        centre: (3,) the point, in the world before.
+        level: whether it turns about the vertical only.
+    """
+    axes = turned_axes(level)
+    turn = gtsam.Rot3.Expmap(axes.T @ g[3 : 3 + len(axes)])
+    return gtsam.Pose3(turn, centre + g[:3] - turn.rotate(centre))
 
 
 def with_free_gauge(

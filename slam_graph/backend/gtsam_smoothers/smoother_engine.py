@@ -79,8 +79,9 @@ class SmootherEngine:
         """What is known of the newest state in the graph."""
         return window.prior
 
-    def regauged(self, window: Window, level: bool) -> None:
-        """Nothing: what is in the lag is linearised anew, and so follows the fixes by itself."""
+    def regauged(self, window: Window, level: bool) -> tuple[Window, None]:
+        """The window as it is: what is in the lag is linearised anew, and so follows by itself."""
+        return window, None
 
     def landmarks(self, window: Window) -> tuple[IntArray, FloatArray]:
         """Ids (N,) and world positions (N, 3) of the features that are variables and tracked."""

@@ -22,7 +22,8 @@ features for good as well, exactly: no later conditional depends on what an earl
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 
 import numpy as np
 from gtsam import Symbol
@@ -117,6 +118,24 @@ class LandmarkStore:
         for key, offset in state.offsets.items():
             if offset.any():
                 self._moved[key] = self._moved.get(key, 0.0) + offset
+
+    def follow_world(
+        self,
+        increments: Mapping[int, FloatArray],
+        of_points: Callable[[FloatArray], FloatArray],
+    ) -> None:
+        """Note that linearisation points have moved with their world.
+
+        Args:
+            increments: of the variables in the state.
+            of_points: how points (N, 3) move.
+        """
+        stored = {L(j): of_points(place.first[None])[0] for j, place in self._places.items()}
+        for key, increment in {**increments, **stored}.items():
+            self._moved[key] = self._moved.get(key, 0.0) + increment
+        self._places = {
+            j: replace(place, first=place.first + stored[L(j)]) for j, place in self._places.items()
+        }
 
     def _bases(self, conditional: Conditional) -> FloatArray:
         """How far the linearisation points of variables (w + n,) are from their first ones."""

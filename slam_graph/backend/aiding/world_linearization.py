@@ -1,0 +1,137 @@
+# SPDX-FileCopyrightText: 2026 The slam_graph authors
+# SPDX-License-Identifier: Apache-2.0
+"""A step that turns the world turns it as one body, its linearisation points with it.
+
+First-estimates Jacobians keep the linearisation point x̄ of every variable, so that what no image
+measures stays unmeasured: with the directions N of the gauge, R N(x̄) = 0. Fixes measure the gauge.
+A step N(x̄) g is a motion of the world for variables that are at x̄ only. A feature whose first
+estimate is metres off does not turn with the cameras that see it; the next frame takes that for an
+error of its images, and corrects what was right. And where estimates turn and x̄ stays, new frames,
+which begin at the estimates, are turned against the old ones in every Jacobian.
+
+So the part N g of a step is replaced by the motion M(g) that it stands for, and the points x̄ move
+with it. The prior turns as well, R N(x̄) = R' N(M x̄). Where steps are repeated until the cost falls
+no more, estimates stay where they are, and only x̄ moves.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import gtsam
+import numpy as np
+from gtsam.symbol_shorthand import X
+
+from slam_graph.arrays import FloatArray
+from slam_graph.backend.aiding.regauging import gauge_directions, gauge_motion
+from slam_graph.backend.aiding.rescaling import rescaled
+from slam_graph.backend.cost.unit_of_length import scale_direction
+from slam_graph.backend.initialization.segment_joint import moved
+from slam_graph.backend.solve.square_root import Layout
+from slam_graph.backend.solve.state import State, dims_of, letter_and_index
+from slam_graph.backend.window import Window
+
+_LEAST_CHANGE = 1e-4
+"""Turn of the world (rad), or change of the logarithm of its scale, from which points are moved."""
+
+
+def moved_with_world(
+    window: Window,
+    before: State,
+    level: bool,
+    scaled_camera: gtsam.Pose3 | None,
+    linear: bool,
+) -> Window:
+    """The window after a step, with the motion of its world that of one body.
+
+    Args:
+        window: between two steps, in the world of the fixes.
+        before: its variables before the last step.
+        level: whether gravity is measured.
+        scaled_camera: body_T_camera of a camera whose unit of length only fixes tell; None where
+            other sensors measure it.
+        linear: whether the estimates are where one step along straight tangents has led.
+    """
+    gauge = _Gauge(window, level, scaled_camera)
+    g = gauge.of_step(before)
+    growth = float(g[-1]) if scaled_camera is not None else 0.0
+    turn = g[3 : 4 if level else 6]
+    if max(float(np.linalg.norm(turn)), abs(growth)) < _LEAST_CHANGE:
+        return window
+    state, known = window.state, window.prior.layout
+    step = gauge.directions(state.first, known) @ g
+    without = state.copy()
+    without.update(known, -step)
+    about = replace(window, state=without, prior=window.prior.shifted(step))
+    grown = rescaled(about, float(np.exp(growth)), scaled_camera)
+    # that scales about the origin
+    back = gtsam.Pose3(gtsam.Rot3(), (1.0 - np.exp(growth)) * gauge.centre)
+    there = moved(grown, gauge_motion(g, gauge.centre, level).compose(back))
+    if not linear:
+        linearised = _with_estimates(there.state, state)
+        off = linearised.offset(known) - there.state.offset(known)
+        there = replace(there, state=linearised, prior=there.prior.shifted(-off))
+    window.lost_features.follow_world(
+        {key: step[columns] for key, columns in known.columns.items()},
+        lambda points: gauge.of_points(points, g),
+    )
+    # points outside the state have moved with the step
+    return replace(there, kept_points=window.kept_points, last_points=window.last_points)
+
+
+class _Gauge:
+    """The directions in which nothing but fixes measures a window.
+
+    Attributes:
+        centre: (3,) the point about which its world turns and is scaled.
+    """
+
+    def __init__(self, window: Window, level: bool, scaled_camera: gtsam.Pose3 | None) -> None:
+        self._window, self._level, self._camera = window, level, scaled_camera
+        self.centre = window.state.first_frames.atPose3(X(window.frame)).translation()
+
+    def directions(self, values: gtsam.Values, layout: Layout) -> FloatArray:
+        """Tangents (n, 4 to 7): shift (m), turn (rad), logarithm of the scale if it is unknown."""
+        N = gauge_directions(values, layout, self.centre, self._level)
+        if self._camera is None:
+            return N
+        arm = np.asarray(self._camera.translation())
+        return np.column_stack([N, scale_direction(values, layout, self.centre, arm)])
+
+    def of_step(self, before: State) -> FloatArray:
+        """The motion (4 to 7,) of the world that is nearest to what a step did to the poses."""
+        state, known = self._window.state, self._window.prior.layout
+        poses = [key for key in known.dims if letter_and_index(key)[0] == "x"]
+        layout = Layout(dims_of(key for key in poses if before.frames.exists(key)))
+        N = self.directions(state.first_frames, layout)
+        moves = [
+            before.frames.atPose3(key).localCoordinates(state.frames.atPose3(key))
+            for key in layout.dims
+        ]
+        step = np.concatenate([np.zeros(0), *moves])
+        return np.asarray(np.linalg.lstsq(N, step, rcond=None)[0])
+
+    def of_points(self, points: FloatArray, g: FloatArray) -> FloatArray:
+        """How points (N, 3) move with the world, to first order."""
+        motion = gauge_motion(g, self.centre, self._level)
+        turn = gtsam.Rot3.Logmap(motion.rotation())
+        moves: FloatArray = g[:3] + np.cross(turn, points - self.centre)
+        return moves if self._camera is None else moves + g[-1] * (points - self.centre)
+
+
+def _with_estimates(points: State, estimates: State) -> State:
+    """A state with the linearisation points of one, and the estimates of another one."""
+    there, layout = State(), Layout(dims_of(estimates.variables()))
+    there.insert(points.first_frames)
+    there.insert_points(points.points.ids, points.points.first)
+    tangents = points.first_frames.localCoordinates(estimates.frames)
+    offset = np.zeros(layout.size)
+    places = dict(zip(points.points.ids.tolist(), range(len(points.points.ids)), strict=True))
+    apart = estimates.points.estimate - points.points.first
+    for key, columns in layout.columns.items():
+        kind, index = letter_and_index(key)
+        offset[columns] = apart[places[index]] if kind == "l" else tangents.at(key)
+    there.update(layout, offset)
+    there.freeze(estimates.frozen)
+    there.motions = dict(estimates.motions)
+    return there
