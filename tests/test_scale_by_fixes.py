@@ -229,6 +229,8 @@ def test_a_run_with_fixes_is_in_metres_in_their_world(tmp_path: Any) -> None:
     assert np.sqrt(np.mean(errors_m(result) ** 2)) < 0.08
     table = result.metrics
     assert table["world"]["of_fixes"]
+    assert table["world"]["of_truth"]
+    assert table["nees"]["alignment"] == "none"
     assert table["extent"]["scale"] == "metres"
     assert table["extent"]["alignment"] == "se3"
     assert table["accuracy"]["se3"]["ate"]["translation_m"]["rmse"] < 0.08

@@ -56,7 +56,8 @@ class SquareRootEngine:
     ) -> NavState:
         """One turn of the loop: the three modules, in order."""
         context = self._context
-        self._posterior = self._cost = None  # large, and not to be kept beside those of this step
+        # large, and not to be kept beside those of this step
+        self._posterior = self._cost = self._before = None
         with report.timed("propagation"):
             corrected = context.by_images(frame, window.points)
             context.propagation.append_frame(window, context.imu, stamp_ns, still_sigma, corrected)
@@ -70,7 +71,8 @@ class SquareRootEngine:
             constructed, minimum = self._minimize(window, constructed)
             self._construction.reject_residuals(window, constructed)
             self._describe(window, constructed, minimum, report)
-        self._before, self._is_linear = window.state, len(minimum.costs) == 2
+        undamped = self._policies.gauss_newton.damping == "none"
+        self._before, self._is_linear = window.state, undamped and len(minimum.costs) == 2
         with report.timed("marginalization"):
             marginalize_step(window, constructed, minimum, self._policies)
         self._posterior, self._cost = minimum.posterior, constructed.cost
@@ -111,9 +113,10 @@ class SquareRootEngine:
         """The window in the world where the cost of the last step is least, linearised there."""
         found = self._moved(window, level)
         window, motion = (window, None) if found is None else found
-        if self._before is not None and self._policies.marginalization.first_estimates:
+        before, self._before = self._before, None  # once for each step
+        if before is not None and self._policies.marginalization.first_estimates:
             camera = self._context.rig.scaled_camera
-            window = moved_with_world(window, self._before, level, camera, self._is_linear)
+            window = moved_with_world(window, before, level, camera, self._is_linear)
         return window, motion
 
     def _moved(self, window: Window, level: bool) -> tuple[Window, gtsam.Pose3] | None:

@@ -213,8 +213,8 @@ def _error_series(truth: Trajectory, result: RunResult) -> Series:
 
 def _nees_series(truth: Trajectory, result: RunResult) -> Series:
     try:
-        given, breaks = result.start_was_given, result.segments.breaks_ns()
-        values, _ = nees_of_run(truth, result.history, given, result.final_ba, breaks)
+        aligned, breaks = result.in_world_of_truth, result.segments.breaks_ns()
+        values, _ = nees_of_run(truth, result.history, aligned, result.final_ba, breaks)
     except DataError:
         return {}
     return {

@@ -133,6 +133,13 @@ class RunResult(RunSummary):
         return self.segments.all_of_fixes
 
     @property
+    def in_world_of_truth(self) -> bool:
+        """Whether the estimate lives in the world of the truth, so that NEES takes no alignment."""
+        if self.georeferenced:
+            return self.input.truth_of_fixes
+        return self.start_was_given
+
+    @property
     def config(self) -> RunConfig:
         """All settings of the run."""
         return self.input.config
@@ -232,9 +239,9 @@ class RunResult(RunSummary):
         if self.groundtruth is None or not len(self.history):
             return None
         try:
-            given, breaks = self.start_was_given, self.segments.breaks_ns()
+            aligned, breaks = self.in_world_of_truth, self.segments.breaks_ns()
             found, _ = evaluation.nees_of_run(
-                self.groundtruth, self.history, given, self.final_ba, breaks
+                self.groundtruth, self.history, aligned, self.final_ba, breaks
             )
         except DataError:
             return None
@@ -310,7 +317,7 @@ class RunResult(RunSummary):
                 ),
                 "moving_objects": objects_table(self.objects, asked, self.estimated_rig),
                 "nees": tables.consistency_table(
-                    truth, self.history, self.start_was_given, self.final_ba, breaks
+                    truth, self.history, self.in_world_of_truth, self.final_ba, breaks
                 ),
                 "nis": evaluation.innovation_report(logs.innovations.columns()),
                 "evidence": self.evidence,

@@ -59,10 +59,12 @@ def moved_with_world(
     if max(float(np.linalg.norm(turn)), abs(growth)) < _LEAST_CHANGE:
         return window
     state, known = window.state, window.prior.layout
-    step = gauge.directions(state.first, known) @ g
+    layout = Layout(dims_of(state.variables()))
+    step = gauge.directions(state.first, layout) @ g
     without = state.copy()
-    without.update(known, -step)
-    about = replace(window, state=without, prior=window.prior.shifted(step))
+    without.update(layout, -step)
+    of_prior = step[layout.indices(known.dims)]
+    about = replace(window, state=without, prior=window.prior.shifted(of_prior))
     grown = rescaled(about, float(np.exp(growth)), scaled_camera)
     # that scales about the origin
     back = gtsam.Pose3(gtsam.Rot3(), (1.0 - np.exp(growth)) * gauge.centre)
@@ -72,7 +74,7 @@ def moved_with_world(
         off = linearised.offset(known) - there.state.offset(known)
         there = replace(there, state=linearised, prior=there.prior.shifted(-off))
     window.lost_features.follow_world(
-        {key: step[columns] for key, columns in known.columns.items()},
+        {key: step[columns] for key, columns in layout.columns.items()},
         lambda points: gauge.of_points(points, g),
     )
     # points outside the state have moved with the step
