@@ -13,9 +13,10 @@ from gtsam.symbol_shorthand import L, V, X
 
 import slam_graph as sg
 from slam_graph.arrays import FloatArray
-from slam_graph.backend.aiding.regauging import gauge_directions
+from slam_graph.backend.aiding.regauging import gauge_directions, moved_by_gauge
 from slam_graph.backend.aiding.world_linearization import moved_with_world
 from slam_graph.backend.cost.unit_of_length import scale_direction
+from slam_graph.backend.engine import SquareRootEngine
 from slam_graph.backend.solve.square_root import Layout
 from slam_graph.backend.solve.state import dims_of
 from slam_graph.backend.window import Window
@@ -25,21 +26,30 @@ G = np.array([0.05, -0.03, 0.02, 0.02, -0.015, 0.03])
 """Shift (m) and turn (rad) of a step."""
 
 
-def after(algorithm: str, cameras: int, duration_s: float) -> Window:
-    """A window without an IMU."""
-    tracks = {"features": 40}
+def estimator_after(
+    algorithm: str, cameras: int, duration_s: float, with_imu: bool = False
+) -> sg.Estimator:
+    """One with a window."""
     sequence = sg.simulate(
-        trajectory="figure8", with_imu=False, cameras=cameras, duration_s=duration_s, rate_hz=10.0,
-        seed=3, tracks=tracks,
+        trajectory="figure8", with_imu=with_imu, cameras=cameras, duration_s=duration_s,
+        rate_hz=10.0, seed=3, tracks={"features": 40},
     )  # fmt: skip
     told = sg.load_config(algorithm)
     estimator = sg.Estimator(sequence.rig, told.algorithm, told.backend)
     for packet in sequence.packets():
+        estimator.add_imu(packet.imu)
         estimator.add_frame(packet.frame)
     assert estimator.window is not None
     assert len(estimator.window.past) > 3
     assert len(estimator.window.state_features) > 5
-    return estimator.window
+    return estimator
+
+
+def after(algorithm: str, cameras: int, duration_s: float, with_imu: bool = False) -> Window:
+    """The window of an estimator."""
+    window = estimator_after(algorithm, cameras, duration_s, with_imu).window
+    assert window is not None
+    return window
 
 
 @pytest.fixture(scope="module")
@@ -53,12 +63,13 @@ def stepped(window: Window, camera: gtsam.Pose3 | None = None, g: FloatArray = G
     layout = window.prior.layout
     first = window.state.first
     centre = window.state.first_frames.atPose3(X(window.frame)).translation()
-    step = gauge_directions(first, layout, centre, level=False) @ g
+    step = gauge_directions(first, layout, centre, level=len(g) == 4) @ g
     if camera is not None:
         step += 0.02 * scale_direction(first, layout, centre, np.asarray(camera.translation()))
     state = window.state.copy()
     state.update(layout, step)
-    return replace(window, state=state, prior=window.prior.shifted(-step))
+    lost = deepcopy(window.lost_features)
+    return replace(window, state=state, prior=window.prior.shifted(-step), lost_features=lost)
 
 
 def seen_from_the_body(window: Window, first: bool) -> tuple[FloatArray, FloatArray]:
@@ -96,6 +107,31 @@ def test_a_step_of_the_world_keeps_all_that_is_relative(window: Window) -> None:
     assert np.abs(apart).max() < 0.05, "what nothing measures stays unmeasured"
 
 
+def test_with_an_imu_the_world_turns_about_the_vertical() -> None:
+    window = after("msckf", 2, 3.0, with_imu=True)
+    after_step = stepped(window, g=G[[0, 1, 2, 5]])
+    there = moved_with_world(after_step, window.state, True, None, linear=True)
+    for first in (True, False):
+        for old, new in zip(*(seen_from_the_body(w, first) for w in (window, there)), strict=True):
+            np.testing.assert_allclose(new, old, atol=1e-4)
+
+
+def test_a_world_that_is_moved_after_a_step_is_moved_once() -> None:
+    """What a damped step has left is no part of the step."""
+    estimator = estimator_after("msckf", 2, 3.0)
+    window, engine = estimator.window, estimator._engine
+    assert window is not None
+    assert isinstance(engine, SquareRootEngine)
+    known = window.prior.shifted(window.state.offset(window.prior.layout))
+    there, engine._posterior, _ = moved_by_gauge(window, known, G)
+    engine._before = there.state  # a step that did nothing
+    back, motion = engine.regauged(there, level=False, measured=True)
+    assert motion is not None
+    for first in (True, False):
+        for old, new in zip(*(seen_from_the_body(w, first) for w in (window, back)), strict=True):
+            np.testing.assert_allclose(new, old, atol=1e-6)
+
+
 def test_estimates_at_the_least_cost_stay(window: Window) -> None:
     """Only the points of linearisation move, and the prior has its mean where it was."""
     after_step = stepped(window)
@@ -124,11 +160,9 @@ def test_features_that_are_not_tracked_move_with_the_world() -> None:
     window = after("swf", 2, 4.0)
     ids = np.array(sorted(window.lost_features._places))[:10]
     assert len(ids) > 3
-    there = moved_with_world(
-        replace(stepped(window, g=0.1 * G), lost_features=deepcopy(window.lost_features)),
-        *(window.state, False, None),
-        linear=True,
-    )
+    there = window
+    for _ in range(5):  # by 12 degrees in all
+        there = moved_with_world(stepped(there), there.state, False, None, linear=True)
     seen = []
     for each in (window, there):
         state = each.state.copy()

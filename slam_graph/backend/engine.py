@@ -43,8 +43,8 @@ class SquareRootEngine:
         )
         self._posterior: SquareRootInformation | None = None
         self._cost: Cost | None = None
-        self._before: State | None = None  # the last step
-        self._is_linear = True  # that step, along straight tangents
+        self._before: State | None = None  # the last step, where it keeps first estimates
+        self._is_linear = True  # that step, as it was one along straight tangents
 
     def step(
         self,
@@ -71,8 +71,10 @@ class SquareRootEngine:
             constructed, minimum = self._minimize(window, constructed)
             self._construction.reject_residuals(window, constructed)
             self._describe(window, constructed, minimum, report)
+        if self._policies.marginalization.first_estimates and not minimum.repeated:
+            self._before = window.state
         undamped = self._policies.gauss_newton.damping == "none"
-        self._before, self._is_linear = window.state, undamped and len(minimum.costs) == 2
+        self._is_linear = undamped and len(minimum.costs) == 2
         with report.timed("marginalization"):
             marginalize_step(window, constructed, minimum, self._policies)
         self._posterior, self._cost = minimum.posterior, constructed.cost
@@ -109,12 +111,16 @@ class SquareRootEngine:
         """The posterior of the last step, or what the start left behind."""
         return self._posterior or window.prior
 
-    def regauged(self, window: Window, level: bool) -> tuple[Window, gtsam.Pose3 | None]:
+    def regauged(
+        self, window: Window, level: bool, measured: bool
+    ) -> tuple[Window, gtsam.Pose3 | None]:
         """The window in the world where the cost of the last step is least, linearised there."""
+        before, self._before = self._before, None  # once for each step
         found = self._moved(window, level)
         window, motion = (window, None) if found is None else found
-        before, self._before = self._before, None  # once for each step
-        if before is not None and self._policies.marginalization.first_estimates:
+        if motion is not None and before is not None:
+            before = before.moved(motion)
+        if measured and before is not None:
             camera = self._context.rig.scaled_camera
             window = moved_with_world(window, before, level, camera, self._is_linear)
         return window, motion

@@ -174,15 +174,19 @@ class Engine(Protocol):
         """What the last step knew of the variables, the calibration among them."""
         ...
 
-    def regauged(self, window: Window, level: bool) -> tuple[Window, gtsam.Pose3 | None]:
+    def regauged(
+        self, window: Window, level: bool, measured: bool
+    ) -> tuple[Window, gtsam.Pose3 | None]:
         """The window in the world where the cost of the last step is least, linearised there.
 
         Args:
             window: after the step.
             level: whether gravity is measured, so that the world turns about the vertical only.
+            measured: whether the step had a measurement of the place of the world.
 
         Returns:
-            With the motion new_T_old of the worlds; None if estimates stay.
+            With the motion new_T_old of the worlds; None if estimates stay where the step has put
+            them, to first order.
         """
         ...
 

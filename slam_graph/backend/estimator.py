@@ -387,7 +387,8 @@ class Estimator(EstimatorKnowledge):
         """The state, moved with its world as far as fixes ask for it and the steps did not."""
         if state is None or not self.aiding.aligned:
             return state
-        self.window, motion = self._engine.regauged(window, self.rig.has_imu)
+        level, measured = self.rig.has_imu, self.aiding.measured
+        self.window, motion = self._engine.regauged(window, level, measured)
         return state if motion is None else self.aiding.in_moved_world(state, motion)
 
     def exclude(self, ids: IntArray) -> None:

@@ -72,6 +72,7 @@ class Aiding:
         found: how it became that; None before.
         moved: new_T_old of its motions since then.
         used: whether there was anything to take so far.
+        measured: whether the last step had a fix.
         gates: of the sources of fixes, by name.
         odometry: of wheels or legs.
         offset_s: time offset: added to the times of position fixes, beyond the given one.
@@ -95,6 +96,7 @@ class Aiding:
         self.gates: defaultdict[str, FixGate] = defaultdict(FixGate)
         self.odometry = OdometryFactors(config.odometry)
         self.used, self.offset_s, self._offset_sigma_s = False, 0.0, 0.0
+        self.measured = False
         self._shifted_s = 0.0  # added to the times of fixes that wait
         self._revised_ns = int(np.iinfo(np.int64).min) // 2  # never
         self.restart()
@@ -174,7 +176,7 @@ class Aiding:
         self.odometry.take(self._data)
         first, last = (state.frames.atPose3(pose_key(i)) for i in frames)
         speed = float(np.linalg.norm(state.frames.atVector(V(frames[0]))))
-        factors = self.odometry.factors(frames, stamps_ns, speed)
+        factors, self.measured = self.odometry.factors(frames, stamps_ns, speed), False
         if not self.aligned:
             return factors
         unknown = self._follow(state, prior)
@@ -200,6 +202,7 @@ class Aiding:
             # a tag that is taken for another one is wrong in position and orientation
             if weight == 0.0 or (fix.is_of_pose and fix.stamp_ns in wrong):
                 continue
+            self.measured = True
             if seen is None or self.variables is None:
                 factors.append(here.factor(key, weight))
             else:

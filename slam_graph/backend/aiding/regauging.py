@@ -180,6 +180,8 @@ def gauge_directions(
     """
     axes = turned_axes(level)
     directions = np.zeros((layout.size, 3 + len(axes)))
+    at_points: list[int] = []
+    points: list[FloatArray] = []
     for key, columns in layout.columns.items():
         kind, block = letter_and_index(key)[0], directions[columns]
         if kind == "x":
@@ -191,6 +193,11 @@ def gauge_directions(
         elif kind == "v":
             block[:, 3:] = np.cross(axes, values.atVector(key)).T
         elif kind == "l":
-            block[:, :3] = np.eye(3)
-            block[:, 3:] = np.cross(axes, values.atPoint3(key) - centre).T
+            at_points.append(columns.start)
+            points.append(values.atPoint3(key))
+    if points:
+        rows = np.array(at_points)[:, None] + np.arange(3)
+        directions[rows, :3] = np.eye(3)
+        arms = np.array(points)[:, None] - centre
+        directions[rows, 3:] = np.cross(axes, arms).transpose(0, 2, 1)
     return directions

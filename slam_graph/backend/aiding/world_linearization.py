@@ -9,8 +9,9 @@ estimate is metres off does not turn with the cameras that see it; the next fram
 error of its images, and corrects what was right. And where estimates turn and x̄ stays, new frames,
 which begin at the estimates, are turned against the old ones in every Jacobian.
 
-So the part N g of a step is replaced by the motion M(g) that it stands for, and the points x̄ move
-with it. The prior turns as well, R N(x̄) = R' N(M x̄). Where steps are repeated until the cost falls
+So the part N g of a step is replaced by the motion M(g) that it stands for, and the linearisation
+points become M x̄. The prior ‖R δ - d‖² becomes one with R' = R T⁻¹, where T turns the axes of
+velocities and features, so that R' N(M x̄) = R N(x̄). Where steps are repeated until the cost falls
 no more, estimates stay where they are, and only x̄ moves.
 """
 
@@ -33,6 +34,11 @@ from slam_graph.backend.window import Window
 
 _LEAST_CHANGE = 1e-4
 """Turn of the world (rad), or change of the logarithm of its scale, from which points are moved."""
+_LEAST_SHIFT_M = 1e-3
+"""The same for a shift of the world."""
+_SIGNIFICANT = 3.0
+"""Where a change of the scale is below this many of its σ, by how well a motion of the world
+explains what a step did to the poses, there is none: over a short baseline it would be noise."""
 
 
 def moved_with_world(
@@ -55,8 +61,8 @@ def moved_with_world(
     gauge = _Gauge(window, level, scaled_camera)
     g = gauge.of_step(before)
     growth = float(g[-1]) if scaled_camera is not None else 0.0
-    turn = g[3 : 4 if level else 6]
-    if max(float(np.linalg.norm(turn)), abs(growth)) < _LEAST_CHANGE:
+    change = max(float(np.linalg.norm(g[3 : 4 if level else 6])), abs(growth))
+    if change < _LEAST_CHANGE and float(np.linalg.norm(g[:3])) < _LEAST_SHIFT_M:
         return window
     state, known = window.state, window.prior.layout
     layout = Layout(dims_of(state.variables()))
@@ -66,23 +72,28 @@ def moved_with_world(
     of_prior = step[layout.indices(known.dims)]
     about = replace(window, state=without, prior=window.prior.shifted(of_prior))
     grown = rescaled(about, float(np.exp(growth)), scaled_camera)
-    # that scales about the origin
+    # `rescaled` leaves the origin where it is, the gauge its centre
     back = gtsam.Pose3(gtsam.Rot3(), (1.0 - np.exp(growth)) * gauge.centre)
-    there = moved(grown, gauge_motion(g, gauge.centre, level).compose(back))
+    motion = gauge_motion(g, gauge.centre, level).compose(back)
+    there = moved(grown, motion)
     if not linear:
         linearised = _with_estimates(there.state, state)
         off = linearised.offset(known) - there.state.offset(known)
         there = replace(there, state=linearised, prior=there.prior.shifted(-off))
-    window.lost_features.follow_world(
-        {key: step[columns] for key, columns in layout.columns.items()},
-        lambda points: gauge.of_points(points, g),
-    )
+    if scaled_camera is None:
+        increments = {key: step[columns] for key, columns in layout.columns.items()}
+        window.lost_features.follow_world(motion, gauge.centre, increments)
+    else:
+        window.lost_features.forget()
     # points outside the state have moved with the step
     return replace(there, kept_points=window.kept_points, last_points=window.last_points)
 
 
 class _Gauge:
     """The directions in which nothing but fixes measures a window.
+
+    Numbers g along them are a shift (m), a turn (rad), and the logarithm of the scale if that is
+    unknown: 4 to 7 of them.
 
     Attributes:
         centre: (3,) the point about which its world turns and is scaled.
@@ -93,7 +104,12 @@ class _Gauge:
         self.centre = window.state.first_frames.atPose3(X(window.frame)).translation()
 
     def directions(self, values: gtsam.Values, layout: Layout) -> FloatArray:
-        """Tangents (n, 4 to 7): shift (m), turn (rad), logarithm of the scale if it is unknown."""
+        """Tangents (n, 4 to 7) of variables.
+
+        Args:
+            values: of the variables.
+            layout: their columns.
+        """
         N = gauge_directions(values, layout, self.centre, self._level)
         if self._camera is None:
             return N
@@ -101,7 +117,11 @@ class _Gauge:
         return np.column_stack([N, scale_direction(values, layout, self.centre, arm)])
 
     def of_step(self, before: State) -> FloatArray:
-        """The motion (4 to 7,) of the world that is nearest to what a step did to the poses."""
+        """The motion g of the world that is nearest to what a step did to the poses.
+
+        Args:
+            before: the variables before the step.
+        """
         state, known = self._window.state, self._window.prior.layout
         poses = [key for key in known.dims if letter_and_index(key)[0] == "x"]
         layout = Layout(dims_of(key for key in poses if before.frames.exists(key)))
@@ -110,19 +130,32 @@ class _Gauge:
             before.frames.atPose3(key).localCoordinates(state.frames.atPose3(key))
             for key in layout.dims
         ]
-        step = np.concatenate([np.zeros(0), *moves])
-        return np.asarray(np.linalg.lstsq(N, step, rcond=None)[0])
+        step = np.concatenate([np.zeros(0), *moves])  # of no poses: nothing
+        g = np.asarray(np.linalg.lstsq(N, step, rcond=None)[0])
+        if self._camera is not None and not _is_significant(N, step, g):
+            g[:-1] = np.linalg.lstsq(N[:, :-1], step, rcond=None)[0]
+            g[-1] = 0.0
+        return g
 
-    def of_points(self, points: FloatArray, g: FloatArray) -> FloatArray:
-        """How points (N, 3) move with the world, to first order."""
-        motion = gauge_motion(g, self.centre, self._level)
-        turn = gtsam.Rot3.Logmap(motion.rotation())
-        moves: FloatArray = g[:3] + np.cross(turn, points - self.centre)
-        return moves if self._camera is None else moves + g[-1] * (points - self.centre)
+
+def _is_significant(N: FloatArray, step: FloatArray, g: FloatArray) -> bool:
+    """Whether the last of some numbers g (k,), step (n,) ≈ N (n, k) g, is more than noise."""
+    free = len(step) - len(g)
+    information = N.T @ N
+    if free <= 0 or np.linalg.cond(information) > 1.0 / np.finfo(np.float64).eps:
+        return False
+    variance = np.sum((step - N @ g) ** 2) / free
+    sigma = np.sqrt(variance * np.linalg.inv(information)[-1, -1])
+    return bool(abs(g[-1]) > _SIGNIFICANT * sigma)
 
 
 def _with_estimates(points: State, estimates: State) -> State:
-    """A state with the linearisation points of one, and the estimates of another one."""
+    """A state with the linearisation points of one, and the estimates of another one.
+
+    Args:
+        points: of the same variables.
+        estimates: in the same world.
+    """
     there, layout = State(), Layout(dims_of(estimates.variables()))
     there.insert(points.first_frames)
     there.insert_points(points.points.ids, points.points.first)

@@ -79,7 +79,7 @@ class SmootherEngine:
         """What is known of the newest state in the graph."""
         return window.prior
 
-    def regauged(self, window: Window, level: bool) -> tuple[Window, None]:
+    def regauged(self, window: Window, level: bool, measured: bool) -> tuple[Window, None]:
         """The window as it is: what is in the lag is linearised anew, and so follows by itself."""
         return window, None
 

@@ -22,9 +22,10 @@ features for good as well, exactly: no later conditional depends on what an earl
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
+import gtsam
 import numpy as np
 from gtsam import Symbol
 from gtsam.symbol_shorthand import L
@@ -36,7 +37,10 @@ from slam_graph.backend.solve.square_root import (
     SquareRootInformation,
     trapezoidal,
 )
-from slam_graph.backend.solve.state import POINT_DIM, State, dims_of
+from slam_graph.backend.solve.state import POINT_DIM, State, dims_of, letter_and_index
+
+_TURNING = "vl"
+"""Letters of variables whose tangents are in axes of the world, and not of the body."""
 
 _MAX_EXCHANGES = 300
 """Work limit: after this many conditionals were reordered to recall features, the store closes."""
@@ -70,6 +74,7 @@ class LandmarkStore:
         self._dropped = 0  # conditionals that are no longer there; places count from the first one
         self._places: dict[int, _Place] = {}
         self._moved: dict[int, FloatArray] = {}  # how far linearisation points are from the first
+        self._axes = np.eye(3)  # turn from the axes of the conditionals to those of the world now
 
     def __len__(self) -> int:
         """How many features are stored."""
@@ -94,10 +99,16 @@ class LandmarkStore:
                 (first,) = state.positions_of(np.array([symbol.index()]), first=True)
                 self._places[symbol.index()] = _Place(self._end, first)
         offset = np.concatenate([state.offset(part) for part in conditional.layouts])
-        self._conditionals.append(conditional.shifted(-offset - self._bases(conditional)))
+        about_first = conditional.shifted(-offset - self._bases(conditional))
+        self._conditionals.append(self._turned(about_first, self._axes.T))
         size = sum(each.rows.nbytes for each in self._conditionals)
         while size > _MAX_BYTES:
             size -= self._drop_oldest()
+
+    @property
+    def _has_first_axes(self) -> bool:
+        """Whether the world has not turned since the conditionals were stored."""
+        return bool(np.array_equal(self._axes, np.eye(3)))
 
     @property
     def _end(self) -> int:
@@ -120,22 +131,63 @@ class LandmarkStore:
                 self._moved[key] = self._moved.get(key, 0.0) + offset
 
     def follow_world(
-        self,
-        increments: Mapping[int, FloatArray],
-        of_points: Callable[[FloatArray], FloatArray],
+        self, motion: gtsam.Pose3, centre: FloatArray, increments: Mapping[int, FloatArray]
     ) -> None:
-        """Note that linearisation points have moved with their world.
+        """Note that the world has moved, and all linearisation points with it.
+
+        Conditionals stay in the axes of the world where the first of them was stored.
 
         Args:
-            increments: of the variables in the state.
-            of_points: how points (N, 3) move.
+            motion: new_T_old of the worlds.
+            centre: (3,) the point in the old world about which it has turned.
+            increments: of the variables in the state, to first order, along tangents in the old
+                world.
         """
-        stored = {L(j): of_points(place.first[None])[0] for j, place in self._places.items()}
-        for key, increment in {**increments, **stored}.items():
-            self._moved[key] = self._moved.get(key, 0.0) + increment
-        self._places = {
-            j: replace(place, first=place.first + stored[L(j)]) for j, place in self._places.items()
-        }
+        if not self._conditionals:
+            self.forget()
+            return
+        turn = motion.rotation().matrix()
+        self._axes = turn @ self._axes
+        held = {key for part in self._conditionals for key in part.keys}
+        stored = [(L(j), place.first) for j, place in self._places.items()]
+        firsts = np.array([first for _, first in stored]).reshape(-1, 3)
+        there = firsts @ turn.T + motion.translation()
+        shift = motion.transformFrom(centre) - centre
+        straight = shift + np.cross(gtsam.Rot3.Logmap(motion.rotation()), firsts - centre)
+        moves = zip([key for key, _ in stored], straight, strict=True)
+        moved = {}
+        for key, increment in {**increments, **dict(moves)}.items():
+            if key in held:
+                base = self._moved.get(key, 0.0) + increment
+                moved[key] = turn @ base if letter_and_index(key)[0] in _TURNING else base
+        self._moved = moved
+        for (key, _), first in zip(stored, there, strict=True):
+            j = letter_and_index(key)[1]
+            self._places[j] = replace(self._places[j], first=first)
+
+    def forget(self) -> None:
+        """Marginalise all stored features for good, and go on taking others."""
+        self._conditionals.clear()
+        self._places.clear()
+        self._moved.clear()
+        self._axes = np.eye(3)
+
+    def _turned(self, conditional: Conditional, turn: FloatArray) -> Conditional:
+        """A conditional with the axes of velocities and points turned: of δ' = turn δ.
+
+        Args:
+            conditional: over δ.
+            turn: (3, 3).
+        """
+        if self._has_first_axes:
+            return conditional
+        rows, column = conditional.rows.copy(), 0
+        for part in conditional.layouts:
+            for key, dim in part.dims.items():
+                if letter_and_index(key)[0] in _TURNING:
+                    rows[:, column : column + 3] = rows[:, column : column + 3] @ turn.T
+                column += dim
+        return Conditional(*conditional.layouts, rows)
 
     def _bases(self, conditional: Conditional) -> FloatArray:
         """How far the linearisation points of variables (w + n,) are from their first ones."""
@@ -154,9 +206,7 @@ class LandmarkStore:
     def close(self) -> None:
         """Marginalise all stored features for good, and take no more."""
         self.open = False
-        self._conditionals.clear()
-        self._places.clear()
-        self._moved.clear()
+        self.forget()
 
     def recall(
         self, features: IntArray, prior: SquareRootInformation, state: State
@@ -178,6 +228,9 @@ class LandmarkStore:
         self._exchanges += self._end - first
         for k in range(first - self._dropped, len(self._conditionals)):
             self._conditionals[k], carried = _exchanged(self._conditionals[k], carried, wanted)
+        carried = self._turned(carried, self._axes)
+        if not self._has_first_axes:
+            carried = replace(carried, rows=trapezoidal(carried.rows))
         carried = carried.shifted(self._bases(carried))
         for j, place in places.items():
             state.insert_point(j, place.first)
