@@ -89,7 +89,7 @@ def consistency_report(
         truth: the true trajectory.
         history: estimated states.
         aligned: whether the estimate already lives in the world of the truth (the start was
-            given); otherwise it is aligned as `nees_of_run` says.
+            given, or fixes have told it); otherwise it is aligned as `nees_of_run` says.
         smoothed: see `nees_of_run`.
         breaks_ns: see `nees_of_run`.
     """

@@ -229,7 +229,7 @@ class CameraTracker:
 
         Args:
             after: what seems to go on.
-            expected: how many should be in the image, by the gyroscope.
+            expected: how many are predicted to be in the image.
         """
         if self._keeps_few or len(after) >= min(_FEW, _FEW_SHARE * expected):
             return after

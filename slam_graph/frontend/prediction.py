@@ -53,8 +53,8 @@ class ImuMotion:
 
         Args:
             imu: the samples.
-            since_ns: time of the oldest image whose features are still looked for; None for the
-                newest sample.
+            since_ns: stamp of the oldest image whose features are still looked for; None for the
+                newest sample. An offset of its clock is below what is kept in any case.
         """
         self._imu.add(imu)
         newest_ns = self._imu.newest_ns()

@@ -282,7 +282,7 @@ def align_by_epipolar_errors(
         start = _mounted(problem, coarse)
     for grid in _grids(nominal_s, near_s):
         costs = [problem.equations(replace(start, offset_s=s)).least_cost(columns) for s in grid]
-        best = int(np.argmin(costs))
+        best = int(np.argmin(np.nan_to_num(costs, nan=np.inf)))  # pairs of one bearing
         if 0 < best < len(grid) - 1:
             break
     else:

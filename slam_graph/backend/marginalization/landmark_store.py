@@ -17,6 +17,8 @@ others; that it is the same point is no longer used.
 
 The oldest conditionals are dropped where all of them take too much memory. That marginalises their
 features for good as well, exactly: no later conditional depends on what an earlier one eliminated.
+
+Where fixes move the world, what is stored moves with it, to first order in each of the moves.
 """
 
 from __future__ import annotations

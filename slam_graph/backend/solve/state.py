@@ -10,8 +10,9 @@ Tangents are GTSAM's (rotation before translation in the body frame, acceleromet
 
 First-estimates Jacobians (Huang, Mourikis & Roumeliotis 2010): once a variable takes part in the
 marginal prior, all Jacobians with respect to it are evaluated at the value it had then, its *first
-estimate*. Otherwise its linearisation point follows the estimate, and the estimator gains
-information about unobservable directions (global position and yaw).
+estimate*, which moves with the world only (`aiding/world_linearization`). Otherwise its
+linearisation point follows the estimate, and the estimator gains information about unobservable
+directions (global position and yaw).
 """
 
 from __future__ import annotations
