@@ -4,7 +4,12 @@
 
 from collections.abc import Iterator
 
+import numpy as np
+from gtsam.symbol_shorthand import L, V, X
+
+from slam_graph.arrays import FloatArray
 from slam_graph.backend.estimator import Estimator
+from slam_graph.backend.window import Window
 from slam_graph.config import load_config
 from slam_graph.datasets import RecordedSequence
 from slam_graph.sensors.measurements import FeatureFrame
@@ -29,3 +34,13 @@ def from_given_state(sequence: RecordedSequence, algorithm: str) -> Iterator[Est
         estimator.add_imu(packet.imu)
         estimator.add_frame(packet.frame)
         yield estimator
+
+
+def seen_from_the_body(window: Window, first: bool) -> tuple[FloatArray, FloatArray]:
+    """Poses with the velocity, and features (N, 3), relative to the last body."""
+    values = window.state.first if first else window.state.estimate
+    last = values.atPose3(X(window.frame))
+    poses = [last.between(values.atPose3(X(i))).matrix().ravel() for i in window.past]
+    points = [last.transformTo(values.atPoint3(L(j))) for j in window.state_features.tolist()]
+    velocity = last.rotation().unrotate(values.atVector(V(window.frame)))
+    return np.concatenate([*poses, velocity]), np.array(points)

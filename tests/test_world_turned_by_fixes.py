@@ -8,8 +8,8 @@ from dataclasses import replace
 import gtsam
 import numpy as np
 import pytest
-from estimating import BELIEVED
-from gtsam.symbol_shorthand import L, V, X
+from estimating import BELIEVED, seen_from_the_body
+from gtsam.symbol_shorthand import X
 
 import slam_graph as sg
 from slam_graph.arrays import FloatArray
@@ -70,16 +70,6 @@ def stepped(window: Window, camera: gtsam.Pose3 | None = None, g: FloatArray = G
     state.update(layout, step)
     lost = deepcopy(window.lost_features)
     return replace(window, state=state, prior=window.prior.shifted(-step), lost_features=lost)
-
-
-def seen_from_the_body(window: Window, first: bool) -> tuple[FloatArray, FloatArray]:
-    """Poses with the velocity, and features (N, 3), relative to the last body."""
-    values = window.state.first if first else window.state.estimate
-    last = values.atPose3(X(window.frame))
-    poses = [last.between(values.atPose3(X(i))).matrix().ravel() for i in window.past]
-    points = [last.transformTo(values.atPoint3(L(j))) for j in window.state_features.tolist()]
-    velocity = last.rotation().unrotate(values.atVector(V(window.frame)))
-    return np.concatenate([*poses, velocity]), np.array(points)
 
 
 def known_of_gauge(window: Window) -> FloatArray:
