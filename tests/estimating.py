@@ -44,3 +44,17 @@ def seen_from_the_body(window: Window, first: bool) -> tuple[FloatArray, FloatAr
     points = [last.transformTo(values.atPoint3(L(j))) for j in window.state_features.tolist()]
     velocity = last.rotation().unrotate(values.atVector(V(window.frame)))
     return np.concatenate([*poses, velocity]), np.array(points)
+
+
+def fed_with(sequence: RecordedSequence, algorithm: str) -> Estimator:
+    """An estimator after all frames, with a window that has past poses and features."""
+    told = load_config(algorithm)
+    estimator = Estimator(sequence.rig, told.algorithm, told.backend)
+    for packet in sequence.packets():
+        assert isinstance(packet.frame, FeatureFrame)
+        estimator.add_imu(packet.imu)
+        estimator.add_frame(packet.frame)
+    assert estimator.window is not None
+    assert len(estimator.window.past) > 3
+    assert len(estimator.window.state_features) > 5
+    return estimator

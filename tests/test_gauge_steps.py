@@ -5,7 +5,7 @@
 import gtsam
 import numpy as np
 import pytest
-from estimating import BELIEVED, seen_from_the_body
+from estimating import BELIEVED, fed_with, seen_from_the_body
 from gtsam.symbol_shorthand import X
 
 import slam_graph as sg
@@ -26,15 +26,9 @@ from slam_graph.geometry import NavState
 def window() -> Window:
     """With past poses and features of the state."""
     sequence = sg.simulate(duration_s=3.0, rate_hz=10, cameras=2, tracks={"features": 40}, seed=3)
-    told = sg.load_config("msckf")
-    estimator = sg.Estimator(sequence.rig, told.algorithm, told.backend)
-    for packet in sequence.packets():
-        estimator.add_imu(packet.imu)
-        estimator.add_frame(packet.frame)
-    assert estimator.window is not None
-    assert len(estimator.window.past) > 5
-    assert len(estimator.window.state_features) > 5
-    return estimator.window
+    found = fed_with(sequence, "msckf").window
+    assert found is not None
+    return found
 
 
 def posterior_of(window: Window) -> SquareRootInformation:

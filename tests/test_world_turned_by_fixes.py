@@ -8,7 +8,7 @@ from dataclasses import replace
 import gtsam
 import numpy as np
 import pytest
-from estimating import BELIEVED, seen_from_the_body
+from estimating import BELIEVED, fed_with, seen_from_the_body
 from gtsam.symbol_shorthand import X
 
 import slam_graph as sg
@@ -34,15 +34,7 @@ def estimator_after(
         trajectory="figure8", with_imu=with_imu, cameras=cameras, duration_s=duration_s,
         rate_hz=10.0, seed=3, tracks={"features": 40},
     )  # fmt: skip
-    told = sg.load_config(algorithm)
-    estimator = sg.Estimator(sequence.rig, told.algorithm, told.backend)
-    for packet in sequence.packets():
-        estimator.add_imu(packet.imu)
-        estimator.add_frame(packet.frame)
-    assert estimator.window is not None
-    assert len(estimator.window.past) > 3
-    assert len(estimator.window.state_features) > 5
-    return estimator
+    return fed_with(sequence, algorithm)
 
 
 def after(algorithm: str, cameras: int, duration_s: float, with_imu: bool = False) -> Window:
