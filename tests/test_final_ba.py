@@ -42,6 +42,7 @@ from slam_graph.simulation.simulated_sequence import SimulatedSequence
 from slam_graph.simulation.simulation_config import (
     FlightConfig,
     LandmarkConfig,
+    SimulatedGnssConfig,
     SimulatedImuConfig,
     SimulationConfig,
     TrackConfig,
@@ -98,7 +99,8 @@ def keep(tmp_path: Path) -> Keep:
     def kept(sequence: SimulatedSequence) -> Kept:
         with FrameLog.recording(sequence.rig, DEFAULT, tmp_path) as log:
             for packet in sequence.packets():
-                log.add(packet.imu, packet.frame, (1.0, 1.0))
+                log.add(packet.imu, packet.frame, (1.0, 1.0), packet.aiding)
+            log.georeferenced = sequence.aiding.fix_stamps_ns.size > 0
         return Kept(sequence, log)
 
     return kept
@@ -174,6 +176,22 @@ def test_segments_join_to_one_trajectory(keep: Keep) -> None:
     assert worst_m(whole.trajectory, cut.trajectory) < 0.0135
     assert [step[2] for step in steps] == list(range(1, cut.summary.iterations + 1))
     assert worst_m(kept.truth, whole.trajectory) < 0.0215
+
+
+def test_segments_in_the_world_of_fixes_know_those_of_all_others(keep: Keep) -> None:
+    """Joined segments differ from one adjustment of all keyframes by a fraction of σ, in
+    trajectory and covariances, and have no steps where they join."""
+    gnss = SimulatedGnssConfig(sigma_m=0.02, rate_hz=5.0, multipath=0.0)
+    kept = keep(flight(2, sigma=1.0, gnss=gnss))
+    whole = kept.adjusted(kept.truth)
+    cut = kept.adjusted(kept.truth, FinalBaConfig(max_keyframes=20))
+    assert cut.summary.segments > 2
+    away = cut.trajectory.positions - whole.trajectory.positions
+    sigmas = whole.history.sigmas()[:, 3:6]
+    assert np.sqrt(np.mean(away**2)) < 0.5 * np.sqrt(np.mean(sigmas**2))
+    assert np.mean(cut.history.sigmas()[:, 3:6] / sigmas) == pytest.approx(1.0, abs=0.1)
+    steps = np.linalg.norm(np.diff(away, axis=0), axis=1)
+    assert steps.max() < 0.001
 
 
 def test_there_is_one_factor_of_all_states_at_a_time(

@@ -253,6 +253,9 @@ def test_the_final_adjustment_is_in_the_world_of_the_poses() -> None:
     assert result.smoothed is not None
     smoothed = ape(sequence.groundtruth(), result.smoothed, alignment="none").statistics.rmse
     assert smoothed < 0.8 * error_m(sequence, result)
+    nees_of = result.metrics["final_ba"]["nees"]
+    assert nees_of["alignment"] == "none"
+    assert 0.1 < nees_of["position"]["mean"] < 12.0  # of one flight
 
 
 @pytest.mark.slow

@@ -187,13 +187,14 @@ def nees_of_run(
         DataError: if truth and estimate share no time.
     """
     estimate, covariances = history.trajectory(), history.pose_covariances()
+    aligned_in_all = aligned and not len(breaks_ns)
     within = smoothed.within if smoothed is not None and history is smoothed.history else None
-    if within is not None:
+    if within is not None and not aligned_in_all:
         covariances = within
     if history.scaled_camera is not None:
         covariances = mounted_covariances(covariances, history.scaled_camera)
         truth, estimate = (path.mounted(history.scaled_camera) for path in (truth, estimate))
-    if aligned and not len(breaks_ns):
+    if aligned_in_all:
         return nees(estimate, covariances, truth), "none"
     if smoothed is not None and not len(breaks_ns):
         synchronize(truth, estimate)

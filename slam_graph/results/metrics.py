@@ -151,15 +151,18 @@ def extent_table(
     }
 
 
-def world_table(history: StateHistory, given: bool, breaks_ns: Sequence[int] = ()) -> Table:
+def world_table(
+    history: StateHistory, given: bool, of_truth: bool, breaks_ns: Sequence[int] = ()
+) -> Table:
     """In which world the estimate lives, and the alignment with a truth that follows from it.
 
     Args:
         history: the causal estimate.
-        given: whether the start was given in the world of the truth.
+        given: whether the start was given.
+        of_truth: whether the estimate lives in the world of the truth.
         breaks_ns: times from which on it lives in another one, of which nothing is known.
     """
-    aligned = given and history.has_scale and not breaks_ns
+    aligned = of_truth and history.has_scale and not breaks_ns
     return {
         "start_was_given": given,
         "world_breaks_ns": list(breaks_ns),
@@ -215,7 +218,11 @@ def segments_table(
 
 
 def final_ba_table(
-    final_ba: FinalBa | None, truth: Trajectory | None, breaks_ns: Sequence[int] = ()
+    final_ba: FinalBa | None,
+    truth: Trajectory | None,
+    breaks_ns: Sequence[int] = (),
+    *,
+    of_truth: bool = False,
 ) -> Table | None:
     """Size, cost, accuracy and consistency of the final bundle adjustment, if there was one.
 
@@ -223,12 +230,13 @@ def final_ba_table(
         final_ba: the adjustment.
         truth: the true trajectory.
         breaks_ns: times between worlds.
+        of_truth: whether position fixes or known poses tell the world of the truth.
     """
     if final_ba is None:
         return None
     camera = final_ba.history.scaled_camera
     accuracy = accuracy_table(truth, final_ba.trajectory, camera, breaks_ns)
-    nees = consistency_table(truth, final_ba.history, False, final_ba, breaks_ns)
+    nees = consistency_table(truth, final_ba.history, of_truth, final_ba, breaks_ns)
     fixes = {} if final_ba.fixes is None else {"fixes": final_ba.fixes.table()}
     checked = final_ba.calibration
     calibration = {

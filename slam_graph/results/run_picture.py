@@ -202,7 +202,7 @@ def _alignment_in_map(located: Mapping[str, Any] | None) -> AlignmentMode:
 def with_covariances_after_alignment(
     view: RunView,
     histories: Mapping[str, StateHistory],
-    given: bool,
+    of_truth: bool,
     final_ba: FinalBa | None,
     breaks_ns: Sequence[int] = (),
 ) -> RunView:
@@ -211,7 +211,7 @@ def with_covariances_after_alignment(
     Args:
         view: in the world of the run.
         histories: states of the estimates, by the names of these.
-        given: whether the start was given in the world of the truth.
+        of_truth: whether the estimate lives in the world of the truth already.
         final_ba: the smoothed trajectory, by which the run is aligned.
         breaks_ns: times between worlds.
     """
@@ -222,7 +222,7 @@ def with_covariances_after_alignment(
         return view.at_camera(camera).aligned(free, breaks_ns)
     if breaks_ns:
         return view.aligned(free, breaks_ns)
-    if given:
+    if of_truth:
         return view
     estimates = {}
     similarity = None

@@ -284,6 +284,8 @@ class RunResult(RunSummary):
         frames = max(logs.frames, 1)
         located, camera = self.localization, self.scaled_camera
         breaks = self.segments.breaks_ns()
+        # a start that was given does not define the world of the adjustment
+        smoothed_in_it = self.georeferenced and self.in_world_of_truth
         table: dict[str, Any] = tables.finite(
             {
                 "schema_version": tables.SCHEMA_VERSION,
@@ -300,12 +302,17 @@ class RunResult(RunSummary):
                 }
                 | ({"of_truth": asked.truth_of_fixes} if self.georeferenced else {})
                 | ({} if self.fix_calibration is None else self.fix_calibration.table()),
-                "extent": extent | tables.world_table(self.history, self.start_was_given, breaks),
+                "extent": extent
+                | tables.world_table(
+                    self.history, self.start_was_given, self.in_world_of_truth, breaks
+                ),
                 "segments": tables.segments_table(
                     self.segments, self.trajectory, truth, camera, self.smoothed
                 ),
                 "accuracy": tables.accuracy_table(truth, self.trajectory, camera, breaks),
-                "final_ba": tables.final_ba_table(self.final_ba, truth, breaks),
+                "final_ba": tables.final_ba_table(
+                    self.final_ba, truth, breaks, of_truth=smoothed_in_it
+                ),
                 "loop_closure": tables.loop_closure_table(
                     self.loops, self.loop_closed, truth, camera, self._breaks_of_loops_ns
                 ),
@@ -386,6 +393,6 @@ class RunResult(RunSummary):
         left_ns = self._breaks_of_loops_ns
         view = RunView(estimates, loops, truth, self.points, began_ns, left_ns)
         view = with_covariances_after_alignment(
-            view, histories, self.start_was_given, self.final_ba, self.segments.breaks_ns()
+            view, histories, self.in_world_of_truth, self.final_ba, self.segments.breaks_ns()
         )
         return with_path_in_map(view, self.in_map, self.metrics["localization"])

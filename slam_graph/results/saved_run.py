@@ -287,8 +287,9 @@ class SavedRun(RunSummary):
             view = view.at_camera(self.scaled_camera)
         extent = self.metrics["extent"]
         breaks = extent.get("world_breaks_ns", [])
-        if breaks or not self.start_was_given:
-            view = view.aligned(extent.get("alignment", "yaw"), breaks)
+        mode = extent.get("alignment", "none" if self.start_was_given else "yaw")
+        if breaks or mode != "none":
+            view = view.aligned(mode, breaks)
         return with_path_in_map(view, self.in_map, self.metrics["localization"])
 
     @cached_property

@@ -4,14 +4,14 @@
 
 Without loop closures the estimate inside a segment hardly depends on what is far outside of it. So
 a long recording is solved in overlapping segments. Each is aligned with the one before at a
-keyframe in the middle of their overlap, in position and yaw, which no segment can observe.
+keyframe in the middle of their overlap, in position and yaw, which no segment can observe. Where
+position fixes tell these, segments are joined as in `segment_chain.py`.
 """
 
 from __future__ import annotations
 
 import logging
 import time
-from bisect import bisect_left
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -41,6 +41,7 @@ from slam_graph.backend.smoothing.segment_adjustment import (
     adjust_segment,
     check_minimum,
 )
+from slam_graph.backend.smoothing.segment_chain import SegmentChain
 from slam_graph.backend.smoothing.smoothing_config import FinalBaConfig
 from slam_graph.backend.smoothing.smoothing_task import AdjustedSegment, SegmentStart, SmoothingTask
 from slam_graph.backend.solve.single_thread import on_one_thread
@@ -259,36 +260,32 @@ def _smoothed(log: FrameLog, causal: Trajectory, task: SmoothingTask, report: Re
         task = replace(task, joint=False)
     level = task.rig.has_imu
     history = StateHistory(level, None if log.georeferenced else task.rig.scaled_camera)
-    states: list[NavState] = []  # of the last segment, from its anchor on
-    solved: list[AdjustedSegment] = []
+    chain, solved = SegmentChain(history), list[AdjustedSegment]()
     for first, stop in segments(len(keyframes), longest):
         segment = _read(log, keyframes[first:stop], task)
         stamps_ns = segment.keyframe_stamps_ns
         if not _overlaps(causal, stamps_ns):
             continue
+        # without an IMU errors are judged by the first pose, so that it defines the world
+        anchor = int(np.searchsorted(stamps_ns[:-1], began_ns)) if level else 0
+        if solved:
+            anchor = min(_overlap(longest) // 2, len(stamps_ns) - 1)
+        link, known = chain.at(stamps_ns[anchor]), chain.known(stamps_ns[anchor])
         given = log.aiding, causal, task.backend, log.fix_calibration
-        aiding = aiding_of_keyframes(stamps_ns, *given)
+        aiding = aiding_of_keyframes(stamps_ns, *given, known)
         segment, absolute = replace(segment, aiding=aiding), aiding.absolute
         start = states_at(causal, stamps_ns, segment.imu, task.preintegration)
         if not level:
             task = replace(task, causal=causal)
             start = with_angular_rates(start, segment.imu)
-        # without an IMU errors are judged by the first pose, so that it defines the world
-        anchor = int(np.searchsorted(stamps_ns[:-1], began_ns)) if level else 0
-        begin, link = 0, None
-        if states:
-            anchor = min(_overlap(longest) // 2, len(stamps_ns) - 1)
-            begin = int(segment.keyframes[anchor])
-            joint = bisect_left(states, stamps_ns[anchor], key=_stamp_ns)
-            for state in states[:joint]:
-                history.append(state)
-            link = states[joint]
-            if not absolute:
-                start = _aligned(start, start[anchor], link, level)
+        begin = 0 if link is None else int(segment.keyframes[anchor])
+        if link is not None and not absolute:
+            start = _aligned(start, start[anchor], link, level)
         steps = sum(part.figures.iterations for part in solved)
         own = longest - _overlap(longest) if stop < len(keyframes) else stop - first
         progress = _progress(report, (first, own, len(keyframes)), steps, task.config)
-        adjusted = adjust_segment(SegmentStart(segment, start, anchor), task, progress)
+        joint = own + _overlap(longest) // 2 if absolute and stop < len(keyframes) else None
+        adjusted = adjust_segment(SegmentStart(segment, start, anchor, None, joint), task, progress)
         found = adjusted.states  # steps leave the anchor where it was to some 1e-7 m
         held = found[int(segment.keyframes[anchor])]
         states = found[begin:]
@@ -296,12 +293,13 @@ def _smoothed(log: FrameLog, causal: Trajectory, task: SmoothingTask, report: Re
             states = _aligned(found, held, start[anchor], level)[begin:]
         if link is not None and not absolute:
             states = in_gauge_of(link, states, level)
+        gains = None if adjusted.gains is None else adjusted.gains[begin:]
+        chain.add(states, gains, linked=known is not None)
         aligned = None if solved else adjusted.aligned  # kept where one segment is all
-        solved.append(replace(adjusted, states=[], aligned=aligned))
+        solved.append(replace(adjusted, states=[], gains=None, aligned=aligned))
     if not solved:
         raise EstimationError("the causal estimate covers none of the keyframes")
-    for state in states:
-        history.append(state)
+    chain.end()
     figures = [part.figures for part in solved]
     alone = solved[0] if len(solved) == 1 else None
     summary = summary_of(figures, len(history), began)
@@ -389,10 +387,6 @@ def _progress(
         config: settings, which decide what is done.
     """
     return SegmentProgress(report, *extent, steps=steps, fuses=config.fuse_features)
-
-
-def _stamp_ns(state: NavState) -> int:
-    return state.stamp_ns
 
 
 def _overlaps(causal: Trajectory, stamps_ns: IntArray) -> bool:

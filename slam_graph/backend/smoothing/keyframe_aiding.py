@@ -29,12 +29,34 @@ _LONGEST_GAP_S = 1.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class KnownPose:
+    """What is known of the pose of a keyframe from the segment before, in the world of fixes.
+
+    Attributes:
+        stamp_ns: of the keyframe.
+        world_T_body: its pose.
+        covariance: (6, 6) of it, rotation before position, in axes of the body.
+        until_ns: fixes up to this time are in it.
+    """
+
+    stamp_ns: int
+    world_T_body: gtsam.Pose3
+    covariance: FloatArray
+    until_ns: int
+
+
+_Source = tuple[
+    AidingData, Trajectory, BackendConfig, AidingData.Calibration | None, KnownPose | None
+]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class KeyframeAiding:
     """Factors on keyframes.
 
     Attributes:
-        fixes: absolute ones whose lever arm and clock are held; with `calibrated` they determine
-            the world of the segment.
+        fixes: absolute ones whose lever arm and clock are held, and a known pose; with `calibrated`
+            they determine the world of the segment.
         odometry: between consecutive keyframes.
         source: what they were made of; None for nothing.
         calibrated: fixes whose lever arm or clock is a variable; None where they are held.
@@ -42,9 +64,7 @@ class KeyframeAiding:
 
     fixes: tuple[gtsam.NonlinearFactor, ...] = ()
     odometry: tuple[gtsam.NonlinearFactor, ...] = ()
-    source: tuple[AidingData, Trajectory, BackendConfig, AidingData.Calibration | None] | None = (
-        None
-    )
+    source: _Source | None = None
     calibrated: CalibratedFixes | None = None
 
     @property
@@ -67,11 +87,13 @@ def aiding_of_keyframes(
     causal: Trajectory,
     config: BackendConfig,
     found: AidingData.Calibration | None = None,
+    known: KnownPose | None = None,
 ) -> KeyframeAiding:
     """The factors of fixes, known poses and odometry.
 
     A fix counts at the nearest keyframe, moved there by the causal estimate. With too few fixes
-    for a world there are none, and with orientations alone, as nothing tells the position then.
+    for a world there are none, and with orientations alone, as nothing tells the position then;
+    unless the pose of a keyframe is known.
 
     Args:
         stamps_ns: (K,) of the keyframes.
@@ -80,10 +102,11 @@ def aiding_of_keyframes(
         config: lever arms, time offsets, noise.
         found: lever arm and clock of the fixes, if they are variables; `data` has the times that
             they were found to have.
+        known: the pose of one of the keyframes.
     """
     if not len(data):
         return KeyframeAiding()
-    source = data, causal, config, found
+    source = data, causal, config, found, known
     near = config.on_the_clock(data).within(int(stamps_ns[0]), int(stamps_ns[-1]))
     measured = fixes_of(near, config, None if found is None else found.lever_arm_m)
     fixes_ns = np.array([fix.stamp_ns for fix in measured], dtype=np.int64)
@@ -96,15 +119,20 @@ def aiding_of_keyframes(
     free: list[tuple[PositionFix, tuple[gtsam.Pose3, gtsam.Pose3], int]] = []
     for fix, pose, k in zip(measured, then, keyframes, strict=True):
         here = at[k]
-        if pose is not None and here is not None:
+        used_before = known is not None and fix.stamp_ns <= known.until_ns
+        if pose is not None and here is not None and not used_before:
             used.append(fix)
             if found is not None and isinstance(fix, PositionFix) and fix.is_timed:
                 free.append((fix, (pose, here), k))
                 continue
             fixes.append(fix.moved(pose, here).factor(pose_key(k), robust=True))
     located = any(isinstance(fix, PositionFix) for fix in used)
-    if not located or not enough_fixes(used):
+    if known is None and not (located and enough_fixes(used)):
         fixes, free = [], []
+    if known is not None:
+        k = int(np.searchsorted(stamps_ns, known.stamp_ns))
+        noise = gtsam.noiseModel.Gaussian.Covariance(known.covariance)
+        fixes.append(gtsam.PriorFactorPose3(pose_key(k), known.world_T_body, noise))
     calibrated = None
     if found is not None and free:
         calibrated = _calibrated(free, causal, FixVariables(config.gnss), found)

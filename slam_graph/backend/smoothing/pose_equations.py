@@ -27,6 +27,7 @@ from slam_graph.backend.smoothing.state_covariances import (
 from slam_graph.backend.smoothing.state_elimination import STATE, EliminatedStates
 from slam_graph.backend.solve.stacked_values import stacked_poses
 from slam_graph.backend.solve.state import POSE_DIM
+from slam_graph.geometry import NavState
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -114,6 +115,27 @@ class PoseEquations:
     def covariances(self) -> KeyframeCovariances:
         """Covariances of the keyframes."""
         return keyframe_covariances(self.states, self.minimum.values, self.weights, self.level)
+
+    def errors_by(self, keyframe: int, states: list[NavState]) -> FloatArray:
+        """How (N, 15, 6) errors of all frames follow from that of the pose of a keyframe.
+
+        Args:
+            keyframe: its number.
+            states: of the N frames.
+        """
+        rotations = np.array([state.world_T_body.rotation().matrix() for state in states])
+        right = np.zeros((len(self.keyframes), STATE, POSE_DIM))
+        right[keyframe, :POSE_DIM] = np.eye(POSE_DIM)
+        covariances = self.states.times_covariance(right)
+        gains = covariances @ np.linalg.inv(covariances[keyframe, :POSE_DIM])
+        known, _ = stacked_poses(self.minimum.values, range(len(self.keyframes)))
+        back, part = rotations.transpose(0, 2, 1), self.frames.part[:, None, None]
+        for rows in (slice(0, 3), slice(3, 6)):
+            gains[:, rows] = known @ gains[:, rows]
+        found = (1.0 - part) * gains[self.frames.before] + part * gains[self.frames.before + 1]
+        for rows in (slice(0, 3), slice(3, 6)):
+            found[:, rows] = back @ found[:, rows]
+        return np.asarray(found)
 
     def error_rows(self, stamps_ns: IntArray, rotations: FloatArray) -> sparse.csr_array:
         """How pose errors (6 M) at some times follow from those (6 K) of the keyframes.

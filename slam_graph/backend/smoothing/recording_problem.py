@@ -96,7 +96,8 @@ class BundleAdjustment:
     """
 
     def __init__(self, start: SegmentStart, task: SmoothingTask, report: Report) -> None:
-        self._segment = segment = start.segment
+        self._segment, self._joint = start.segment, start.joint
+        segment = start.segment
         self._task, self._rig = replace(task, rig=with_gtsam_cameras(task.rig)), task.rig
         self._backend, self._config = backend, config = task.backend, task.config
         self._projection = RigProjection(self._task.rig, taken_by=task.rig)
@@ -159,12 +160,14 @@ class BundleAdjustment:
             pixel_sigma=self._sigma_px,
             inefficiency=self._inefficiency,
         )
-        aligned, equations, assumed = None, None, self._factors.noise
+        aligned, gains, equations, assumed = None, None, None, self._factors.noise
         try:
             equations = self._equations()
             covariances, self._values = equations.covariances(), equations.minimum.values
             states = self._states(self._segment.stamps_ns)
             states, aligned = with_covariances(states, covariances, equations.frames)
+            if self._joint is not None:
+                gains = equations.errors_by(self._joint, states)
         except (RuntimeError, np.linalg.LinAlgError) as error:
             logger.info("no covariances: %s", " ".join(str(error).split())[:200])
             states, equations = self._states(self._segment.stamps_ns), None
@@ -173,7 +176,8 @@ class BundleAdjustment:
         kept = equations if self._task.joint else None
         found = None if equations is None else equations.minimum
         fixes, calibration = (None, None) if found is None else (found.fixes, found.calibration)
-        return AdjustedSegment(states, figures, aligned, self.imu_noise, kept, fixes, calibration)
+        of_minimum = self.imu_noise, kept, fixes, calibration, gains
+        return AdjustedSegment(states, figures, aligned, *of_minimum)
 
     def solve_loosely(self, stamps_ns: IntArray) -> list[NavState]:
         """States near the minimum, with outliers, to a loose tolerance.
@@ -195,8 +199,6 @@ class BundleAdjustment:
             except (RuntimeError, np.linalg.LinAlgError) as error:
                 logger.info("the noise of the IMU is not learned loosely: %s", error)
         return self._states(stamps_ns)
-
-    # --- features --------------------------------------------------------------------------------
 
     def _triangulated(self, obs: Observations) -> tuple[FloatArray, BoolArray]:
         """Points (J, 3) triangulated from the current poses, and which of them (J,) are usable."""
@@ -285,8 +287,6 @@ class BundleAdjustment:
         obs, variances = obs.rows(used), variances[used]
         enough = np.bincount(views(obs)[0], minlength=len(obs.ids)) >= _MIN_KEYFRAMES
         return obs.subset(enough), points[enough], variances[enough[obs.feature]]
-
-    # --- Levenberg-Marquardt ---------------------------------------------------------------------
 
     def _minimize_loosely(self) -> None:
         """Minimise with all observations to a loose tolerance."""

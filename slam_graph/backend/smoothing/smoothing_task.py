@@ -84,12 +84,14 @@ class SegmentStart:
         states: initial states of the keyframes.
         anchor: number of the keyframe whose position and yaw are fixed.
         loose: the adjustment that `states` come from; None if they are not adjusted yet.
+        joint: number of the keyframe where the next segment takes over; None if there is none.
     """
 
     segment: RecordingSegment
     states: list[NavState]
     anchor: int
     loose: LooseAdjustment | None = None
+    joint: int | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -104,6 +106,8 @@ class AdjustedSegment:
         equations: those at the minimum, if they are wanted and there are covariances.
         fixes: lever arm and clock of position fixes, where they are variables.
         calibration: equations of the calibration at the minimum, if they are wanted and known.
+        gains: (N, 15, 6) how errors of the states follow from that of the pose at the joint with
+            the next segment (`segment_chain.py`); None without one or without covariances.
     """
 
     states: list[NavState]
@@ -113,3 +117,4 @@ class AdjustedSegment:
     equations: PoseEquations | None
     fixes: AidingData.Calibration | None = None
     calibration: CalibrationEquations | None = None
+    gains: FloatArray | None = None

@@ -114,7 +114,8 @@ def with_fused_features(
         tried.append(label)
         states, loose = adjusted(_relabelled(segment, label), states, loose)
     loose = LooseAdjustment(given.states, loose.noise)
-    return SegmentStart(_relabelled(segment, label), states, anchor, loose), steps
+    segment = _relabelled(segment, label)
+    return replace(given, segment=segment, states=states, loose=loose), steps
 
 
 def _relabelled(segment: RecordingSegment, label: IntArray) -> RecordingSegment:
