@@ -19,11 +19,12 @@ from flight import FISHEYE, rig
 from slam_graph.backend.backend_config import BackendConfig
 from slam_graph.backend.smoothing import final_adjustment, segment_adjustment
 from slam_graph.backend.smoothing.causal_outliers import causal_outliers
-from slam_graph.backend.smoothing.final_adjustment import FinalBa, adjust_recording, segments
+from slam_graph.backend.smoothing.final_adjustment import FinalBa, adjust_recording
 from slam_graph.backend.smoothing.frame_log import FrameLog
 from slam_graph.backend.smoothing.keyframe_states import state_at
 from slam_graph.backend.smoothing.learned_imu_noise import _LinearImages
 from slam_graph.backend.smoothing.recording_factors import nearest_keyframe
+from slam_graph.backend.smoothing.segment_chain import segments
 from slam_graph.backend.smoothing.smoothing_config import FinalBaConfig
 from slam_graph.backend.smoothing.smoothing_task import SmoothingTask
 from slam_graph.backend.smoothing.state_elimination import ChainEquations, EliminatedStates

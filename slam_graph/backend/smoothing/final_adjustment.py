@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -41,7 +41,7 @@ from slam_graph.backend.smoothing.segment_adjustment import (
     adjust_segment,
     check_minimum,
 )
-from slam_graph.backend.smoothing.segment_chain import SegmentChain
+from slam_graph.backend.smoothing.segment_chain import SegmentChain, overlap_of, segments
 from slam_graph.backend.smoothing.smoothing_config import FinalBaConfig
 from slam_graph.backend.smoothing.smoothing_task import AdjustedSegment, SegmentStart, SmoothingTask
 from slam_graph.backend.solve.single_thread import on_one_thread
@@ -53,8 +53,6 @@ from slam_graph.sensors import AidingData, CalibrationEstimate, Rig
 logger = logging.getLogger(__name__)
 
 
-OVERLAP = 50
-"""Keyframes that consecutive segments share (10 s at the default spacing); half of a short one."""
 _STRIDE, _CONTEXT = 10, 40
 """Backward extension: keyframes per stride, and later keyframes that are adjusted with them."""
 _MIN_KEYFRAMES = 3
@@ -269,7 +267,7 @@ def _smoothed(log: FrameLog, causal: Trajectory, task: SmoothingTask, report: Re
         # without an IMU errors are judged by the first pose, so that it defines the world
         anchor = int(np.searchsorted(stamps_ns[:-1], began_ns)) if level else 0
         if solved:
-            anchor = min(_overlap(longest) // 2, len(stamps_ns) - 1)
+            anchor = min(overlap_of(longest) // 2, len(stamps_ns) - 1)
         link, known = chain.at(stamps_ns[anchor]), chain.known(stamps_ns[anchor])
         given = log.aiding, causal, task.backend, log.fix_calibration
         aiding = aiding_of_keyframes(stamps_ns, *given, known)
@@ -282,17 +280,14 @@ def _smoothed(log: FrameLog, causal: Trajectory, task: SmoothingTask, report: Re
         if link is not None and not absolute:
             start = _aligned(start, start[anchor], link, level)
         steps = sum(part.figures.iterations for part in solved)
-        own = longest - _overlap(longest) if stop < len(keyframes) else stop - first
+        own = longest - overlap_of(longest) if stop < len(keyframes) else stop - first
         progress = _progress(report, (first, own, len(keyframes)), steps, task.config)
-        joint = own + _overlap(longest) // 2 if absolute and stop < len(keyframes) else None
+        joint = own + overlap_of(longest) // 2 if absolute and stop < len(keyframes) else None
         adjusted = adjust_segment(SegmentStart(segment, start, anchor, None, joint), task, progress)
-        found = adjusted.states  # steps leave the anchor where it was to some 1e-7 m
-        held = found[int(segment.keyframes[anchor])]
-        states = found[begin:]
+        states = adjusted.states[begin:]
         if not absolute:
-            states = _aligned(found, held, start[anchor], level)[begin:]
-        if link is not None and not absolute:
-            states = in_gauge_of(link, states, level)
+            held = states[int(segment.keyframes[anchor]) - begin]
+            states = _placed(states, held, start[anchor], link, level)
         gains = None if adjusted.gains is None else adjusted.gains[begin:]
         chain.add(states, gains, linked=known is not None)
         aligned = None if solved else adjusted.aligned  # kept where one segment is all
@@ -346,33 +341,27 @@ def _extended_backward(
     return causal
 
 
-def segments(keyframes: int, longest: int) -> Iterator[tuple[int, int]]:
-    """First keyframe of each segment, and the one after its last.
-
-    Args:
-        keyframes: number of all keyframes.
-        longest: most keyframes of a segment.
-    """
-    step = longest - _overlap(longest)
-    first = 0
-    while True:
-        stop = min(first + longest, keyframes)
-        yield first, stop
-        if stop == keyframes:
-            return
-        first += step
-
-
-def _overlap(longest: int) -> int:
-    """Keyframes that consecutive segments share."""
-    return min(OVERLAP, longest // 2)
-
-
 def _aligned(
     states: list[NavState], moving: NavState, fixed: NavState, level: bool
 ) -> list[NavState]:
     """States moved by what the gauge leaves open, so that `moving` comes to `fixed`."""
     return in_moved_world(states, world_motion(moving.world_T_body, fixed.world_T_body, level))
+
+
+def _placed(
+    states: list[NavState], held: NavState, place: NavState, link: NavState | None, level: bool
+) -> list[NavState]:
+    """States of a segment in the world of those before, where no fixes tell it.
+
+    Args:
+        states: of the segment.
+        held: that of its anchor, which steps leave where it was to some 1e-7 m.
+        place: where the anchor is.
+        link: the state of the segment before there; None for the first segment.
+        level: whether gravity is measured.
+    """
+    moved = _aligned(states, held, place, level)
+    return moved if link is None else in_gauge_of(link, moved, level)
 
 
 def _progress(

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 The slam_graph authors
 # SPDX-License-Identifier: Apache-2.0
-"""Segments of a recording in the world of position fixes, joined as a smoother joins time steps.
+"""Segments of a recording, joined in the world of position fixes as a smoother joins time steps.
 
 Forward, a segment begins with what the one before knows of the pose at the keyframe where they
 join, and with the fixes that that one has not used. Backward, what it has learned of this pose
@@ -16,6 +16,7 @@ pose alone is carried over, as images tell velocity and biases of both segments.
 from __future__ import annotations
 
 from bisect import bisect_left
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import gtsam
@@ -25,7 +26,31 @@ from slam_graph.arrays import FloatArray
 from slam_graph.backend.smoothing.keyframe_aiding import KnownPose
 from slam_graph.geometry import NavState, StateHistory
 
+OVERLAP = 50
+"""Keyframes that consecutive segments share (10 s at the default spacing); half of a short one."""
 _POSE = slice(0, 6)
+
+
+def segments(keyframes: int, longest: int) -> Iterator[tuple[int, int]]:
+    """First keyframe of each segment, and the one after its last.
+
+    Args:
+        keyframes: number of all keyframes.
+        longest: most keyframes of a segment.
+    """
+    step = longest - overlap_of(longest)
+    first = 0
+    while True:
+        stop = min(first + longest, keyframes)
+        yield first, stop
+        if stop == keyframes:
+            return
+        first += step
+
+
+def overlap_of(longest: int) -> int:
+    """Keyframes that consecutive segments share."""
+    return min(OVERLAP, longest // 2)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -20,7 +20,7 @@ class FinalBaConfig(Settings):
             ("outlier_width", "OUTLIER_WIDTH", "recording_problem"),
             ("gyro_bias_sigma", "GYRO_BIAS_SIGMA", "recording_factors"),
             ("accel_bias_sigma", "ACCEL_BIAS_SIGMA", "recording_factors"),
-            ("overlap_keyframes", "OVERLAP", "final_adjustment"),
+            ("overlap_keyframes", "OVERLAP", "segment_chain"),
         )
     }
 
