@@ -178,6 +178,7 @@ def test_a_narrow_lens_with_another_clock_starts_in_the_hand(
     assert error_m(sequence, states) < 0.03
 
 
+@pytest.mark.slow
 def test_a_right_start_is_not_corrected_by_a_wrong_minimum(data_dir: Path, tmp_path: Path) -> None:
     """What follows the start, solved from nothing, fits 123 of 179 features, 0.9 m/s off."""
     options = {"start_s": 60.0, "duration_s": 6.0, "seed": 106, "sigma": 0.5}

@@ -5,7 +5,7 @@
 from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from itertools import pairwise
+from itertools import count, pairwise
 from pathlib import Path
 from typing import Any
 from weakref import WeakSet
@@ -17,7 +17,7 @@ from estimating import BELIEVED
 from flight import FISHEYE, rig
 
 from slam_graph.backend.backend_config import BackendConfig
-from slam_graph.backend.smoothing import final_adjustment, segment_adjustment
+from slam_graph.backend.smoothing import final_adjustment, recording_problem, segment_adjustment
 from slam_graph.backend.smoothing.causal_outliers import causal_outliers
 from slam_graph.backend.smoothing.final_adjustment import FinalBa, adjust_recording
 from slam_graph.backend.smoothing.frame_log import FrameLog
@@ -193,6 +193,28 @@ def test_segments_in_the_world_of_fixes_know_those_of_all_others(keep: Keep) -> 
     assert np.mean(cut.history.sigmas()[:, 3:6] / sigmas) == pytest.approx(1.0, abs=0.1)
     steps = np.linalg.norm(np.diff(away, axis=0), axis=1)
     assert steps.max() < 0.001
+
+
+@pytest.mark.parametrize("failing", [1, 2, 3])
+def test_a_segment_without_covariances_costs_no_other_one_its_states(
+    keep: Keep, monkeypatch: pytest.MonkeyPatch, failing: int
+) -> None:
+    gnss = SimulatedGnssConfig(sigma_m=0.02, rate_hz=5.0)
+    kept = keep(flight(2, sigma=1.0, gnss=gnss))
+    covariances, number = recording_problem.with_covariances, count(1)
+
+    def failed(*given: Any) -> Any:
+        if next(number) == failing:
+            raise np.linalg.LinAlgError
+        return covariances(*given)
+
+    monkeypatch.setattr(recording_problem, "with_covariances", failed)
+    result = kept.adjusted(kept.truth, FinalBaConfig(max_keyframes=20, fuse_features=False))
+    assert next(number) > 3
+    np.testing.assert_array_equal(result.trajectory.stamps_ns, kept.log.frames_ns)
+    known = np.isfinite(result.history.sigmas()[:, 3])
+    assert 0 < np.sum(~known) < len(known)
+    assert worst_m(kept.truth, result.trajectory) < 0.03
 
 
 def test_there_is_one_factor_of_all_states_at_a_time(

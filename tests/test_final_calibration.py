@@ -102,7 +102,7 @@ def test_a_right_calibration_is_found_to_be_right() -> None:
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        ("turned", "cam0 is turned by"),
+        slow("turned", "cam0 is turned by"),
         slow("longer", "the focal lengths of cam0"),
         slow("bent", "the distortion of cam0"),
         ("late", "the time offset of the cameras is 6."),

@@ -95,6 +95,7 @@ def test_a_given_state_of_one_camera_that_hardly_moves_lets_images_wait() -> Non
     assert first_window(0.05, algorithm="fixed_lag_isam2").images_wait_until_ns is None
 
 
+@pytest.mark.slow
 @pytest.mark.data
 def test_a_given_state_that_hovers_before_it_moves(data_dir: Path) -> None:
     """A hand moves the camera by 20 mm in five seconds; images must not make it a metre."""

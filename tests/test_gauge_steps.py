@@ -148,6 +148,7 @@ def test_frames_of_the_platform_move_with_its_world() -> None:
             np.testing.assert_allclose(objects._window._velocities[k], turned)
 
 
+@pytest.mark.slow
 def test_fixes_turn_the_world_of_an_algorithm_with_damped_steps(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

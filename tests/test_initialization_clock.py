@@ -257,6 +257,7 @@ def test_a_calibration_that_fits_changes_nothing(name: str) -> None:
         assert one.world_T_body.matrix().tobytes() == other.world_T_body.matrix().tobytes()
 
 
+@pytest.mark.slow
 def test_gtsams_smoothers_take_the_offset_as_it_is() -> None:
     estimator, states = estimate(recorded(0.055, 2, 6.0), rig(2), name="fixed_lag_isam2")
     assert estimator.corrected_rig is not None

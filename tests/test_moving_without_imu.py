@@ -9,7 +9,6 @@ from typing import Any
 import gtsam
 import numpy as np
 import pytest
-from groups import slow
 
 from slam_graph import run
 from slam_graph.evaluation import ape
@@ -43,7 +42,8 @@ def beside_an_object(objects: bool, **settings: Any) -> RunResult:
     )
 
 
-@pytest.mark.parametrize("seed", [0, slow(1), slow(3)])
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [0, 1, 3])
 def test_an_object_does_not_pull_two_cameras_without_an_imu(seed: int) -> None:
     result = beside_an_object(objects=False, cameras=2, with_imu=False, seed=seed)
     assert result.status == "ok"

@@ -63,6 +63,7 @@ def test_without_odometry_the_scale_is_unknown() -> None:
     assert result.metrics["extent"]["scale"] == "unknown"
 
 
+@pytest.mark.slow
 def test_a_gap_of_the_odometry_leaves_the_scale_as_it_is() -> None:
     sequence = _flight(9.0)
     whole = sequence.aiding
@@ -118,7 +119,7 @@ def test_two_views_get_the_unit_of_the_odometry_whatever_the_place_of_the_camera
     assert isinstance(in_metres([true[0]] * len(true), still, context), Refusal)
 
 
-@pytest.mark.parametrize("case", ["part", "late", slow("elsewhere")])
+@pytest.mark.parametrize("case", [slow("part"), "late", slow("elsewhere")])
 def test_a_start_takes_what_the_odometry_covers(case: str) -> None:
     """A part of a recording, odometry that begins later than the images, and on another clock."""
     sequence = _flight(6.0)

@@ -365,6 +365,7 @@ def test_without_fixes_results_are_the_same_to_the_bit() -> None:
     assert np.array_equal(without.trajectory.positions, ignored.trajectory.positions)
 
 
+@pytest.mark.slow
 def test_odometry_helps_where_few_features_are_seen() -> None:
     poor = {"features": 20, "pixel_sigma": 2.0}
     backend = {"noise": {"pixel_sigma": 2.0}}

@@ -123,6 +123,7 @@ def test_being_carried_away_is_noticed_whatever_is_in_the_cost(algorithm: str) -
     assert error_m(result, 1) < 0.05
 
 
+@pytest.mark.slow
 def test_a_jump_to_where_everything_fits_is_noticed_by_the_tracks_across_it() -> None:
     result = flown("kidnapped:at_s=6,duration_s=1", rate_hz=20.0)
     assert [segment.joined_by for segment in result.segments] == ["start", "none"]

@@ -99,6 +99,7 @@ def test_a_box_that_moves_from_the_first_frame_on_does_not_take_the_run_with_it(
     assert len(result.trajectory) >= 39
 
 
+@pytest.mark.slow
 def test_a_world_that_fixes_tell_after_that_has_all_states_since_the_start() -> None:
     """The estimate begins again without the box, and is in the world of the fixes later."""
     sequence = simulate(

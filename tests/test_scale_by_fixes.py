@@ -244,6 +244,7 @@ def test_a_run_with_fixes_is_in_metres_in_their_world(tmp_path: Any) -> None:
     assert SavedRun(tmp_path).scaled_camera is None
 
 
+@pytest.mark.slow
 def test_an_algorithm_of_several_steps_takes_the_scale_from_fixes() -> None:
     result = sg.run(flight(), algorithm="okvis", overrides=CAUSAL)
     assert result.history.has_scale

@@ -148,6 +148,7 @@ def test_smoothers_are_left_alone() -> None:
     assert lifted(estimator_for(sequence, "fixed_lag_isam2"), sequence).solved is None
 
 
+@pytest.mark.slow
 def test_states_before_stay_where_fixes_tell_the_world(monkeypatch: pytest.MonkeyPatch) -> None:
     sequence = lift(duration_s=10, gnss={"sigma_m": 0.05})
     overrides = [*STATIC, "final_ba.enabled=false"]

@@ -380,7 +380,8 @@ def test_a_run_that_contradicts_itself_is_suspect(
     assert (result.evidence["position_shift"] is not None) == with_imu
 
 
-@pytest.mark.parametrize("ending", ["limits.recovery=false", slow("the segment is too short")])
+@pytest.mark.slow
+@pytest.mark.parametrize("ending", ["limits.recovery=false", "the segment is too short"])
 def test_what_follows_the_loss_that_ends_a_run_is_not_compared(
     ending: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -409,7 +410,8 @@ def test_what_follows_the_loss_that_ends_a_run_is_not_compared(
     assert "slam-graph doctor says" not in result.message
 
 
-@pytest.mark.parametrize(("all_used", "status"), [slow(True, "suspect"), (False, "ok")])
+@pytest.mark.slow
+@pytest.mark.parametrize(("all_used", "status"), [(True, "suspect"), (False, "ok")])
 def test_what_the_estimator_used_must_show_a_fault_as_well(all_used: bool, status: str) -> None:
     """Most features are on a body that looks like the world to a camera that is turned by 8°."""
     flight = simulate(trajectory="random", duration_s=9.0, rate_hz=RATE_HZ, seed=1)

@@ -236,7 +236,9 @@ def final_ba_table(
         return None
     camera = final_ba.history.scaled_camera
     accuracy = accuracy_table(truth, final_ba.trajectory, camera, breaks_ns)
-    nees = consistency_table(truth, final_ba.history, of_truth, final_ba, breaks_ns)
+    nees = consistency_table(
+        truth, final_ba.history, of_truth and final_ba.absolute, final_ba, breaks_ns
+    )
     fixes = {} if final_ba.fixes is None else {"fixes": final_ba.fixes.table()}
     checked = final_ba.calibration
     calibration = {

@@ -73,13 +73,14 @@ class FinalBa:
         equations: those at the minimum, which others can be joined to; None if they were not wanted
             or are not known, and where the recording was adjusted in several segments.
         fixes: lever arm and clock of the position fixes, where they are variables; of the last
-            segment.
+            segment with fixes of its own.
         calibration: what the recording says of the rig, by one step from the calibration it was
             adjusted with; None if that is not known.
         checked: the equations that this comes from.
         fitting: the calibration with what is clearly off corrected; None if nothing is.
         within: (N, 6, 6) pose covariances as those of the history, but relative to position and yaw
             of a state of the same world; None where all states are in one.
+        absolute: whether fixes tell the world of all states.
     """
 
     history: StateHistory
@@ -92,6 +93,7 @@ class FinalBa:
     calibration: CalibrationEstimate | None = None
     checked: CalibrationEquations | None = None
     fitting: Rig | None = None
+    absolute: bool = False
 
     @property
     def calibration_faults(self) -> list[CalibrationFault]:
@@ -165,7 +167,10 @@ class FinalBa:
         last = parts[-1]
         summary = total_of([found.summary for found in parts])
         own = np.concatenate([found.within for found in parts if found.within is not None])
-        whole = FinalBa(history, summary, None, last.noise, fixes=last.fixes, within=own)
+        of_fixes = all(found.absolute for found in parts)
+        whole = FinalBa(
+            history, summary, None, last.noise, fixes=last.fixes, within=own, absolute=of_fixes
+        )
         return whole.with_calibration([found.checked for found in parts], rig, backend)
 
     def about(self, nominal: Rig, backend: BackendConfig) -> FinalBa:
@@ -258,7 +263,7 @@ def _smoothed(log: FrameLog, causal: Trajectory, task: SmoothingTask, report: Re
         task = replace(task, joint=False)
     level = task.rig.has_imu
     history = StateHistory(level, None if log.georeferenced else task.rig.scaled_camera)
-    chain, solved = SegmentChain(history), list[AdjustedSegment]()
+    chain, solved, all_absolute = SegmentChain(history), list[AdjustedSegment](), True
     for first, stop in segments(len(keyframes), longest):
         segment = _read(log, keyframes[first:stop], task)
         stamps_ns = segment.keyframe_stamps_ns
@@ -272,6 +277,7 @@ def _smoothed(log: FrameLog, causal: Trajectory, task: SmoothingTask, report: Re
         given = log.aiding, causal, task.backend, log.fix_calibration
         aiding = aiding_of_keyframes(stamps_ns, *given, known)
         segment, absolute = replace(segment, aiding=aiding), aiding.absolute
+        all_absolute &= absolute
         start = states_at(causal, stamps_ns, segment.imu, task.preintegration)
         if not level:
             task = replace(task, causal=causal)
@@ -304,7 +310,8 @@ def _smoothed(log: FrameLog, causal: Trajectory, task: SmoothingTask, report: Re
         None if alone is None else alone.aligned,
         solved[-1].noise,
         None if alone is None else alone.equations,
-        solved[-1].fixes,
+        next((part.fixes for part in reversed(solved) if part.fixes is not None), None),
+        absolute=all_absolute,
     )
     checked = [part.calibration for part in solved]
     return whole.with_calibration(checked, task.rig, task.backend)

@@ -69,7 +69,7 @@ class KeyframeAiding:
 
     @property
     def absolute(self) -> bool:
-        """Whether there are fixes, which determine the world."""
+        """Whether there are fixes or a known pose, which determine the world."""
         return len(self.fixes) > 0 or self.calibrated is not None
 
     def shared(self) -> FloatArray:

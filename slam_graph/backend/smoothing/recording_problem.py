@@ -170,7 +170,7 @@ class BundleAdjustment:
                 gains = equations.errors_by(self._joint, states)
         except (RuntimeError, np.linalg.LinAlgError) as error:
             logger.info("no covariances: %s", " ".join(str(error).split())[:200])
-            states, equations = self._states(self._segment.stamps_ns), None
+            states, aligned, equations = self._states(self._segment.stamps_ns), None, None
             self._factors.noise = assumed
         figures = replace(figures, iterations=self.iterations)
         kept = equations if self._task.joint else None

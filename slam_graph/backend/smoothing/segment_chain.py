@@ -10,7 +10,10 @@ goes on to the states of the one before (Rauch, Tung & Striebel 1965, with segme
 
 where x and P are pose and covariance at the joint in the earlier segment, and x' and P' in the
 later one. So the trajectory has no step there, and a fix counts in all segments. Of the joint the
-pose alone is carried over, as images tell velocity and biases of both segments.
+pose alone is carried over, as images tell velocity and biases of both segments, and a lever arm or
+clock that is a variable is estimated in each. Images and IMU samples of the overlap count in both.
+A segment without fixes before the first one with some is not joined so: it stays in the world of
+the causal estimate.
 """
 
 from __future__ import annotations
@@ -55,7 +58,7 @@ def overlap_of(longest: int) -> int:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Part:
-    """N states of a segment, and how they depend (N, 15, 6) on the pose where it ends."""
+    """N states of a segment; how errors (N, 15, 6) follow from that of the pose at its joint."""
 
     states: list[NavState]
     gains: FloatArray | None
@@ -100,7 +103,7 @@ class SegmentChain:
             joint = bisect_left(before.states, states[0].stamp_ns, key=_stamp_ns)
             if linked and before.gains is not None:
                 kept = slice(joint + 1)
-                self._waiting.append(_Part(before.states[kept], before.gains[kept]))
+                self._waiting.append(_Part(before.states[kept], before.gains[kept].copy()))
             else:
                 self._waiting.append(_Part(before.states[: joint + 1], None))
                 self._write(ended=False)
@@ -146,9 +149,9 @@ def _with_later(states: list[NavState], gains: FloatArray, joint: NavState) -> l
         ]
     )
     steps = gains @ move
-    assert states[-1].covariance is not None
-    assert joint.covariance is not None
-    change = (joint.covariance - states[-1].covariance)[_POSE, _POSE]
+    change = np.zeros((6, 6))  # of a segment without covariances the pose alone is known
+    if joint.covariance is not None and states[-1].covariance is not None:
+        change = (joint.covariance - states[-1].covariance)[_POSE, _POSE]
     changes = gains @ change @ gains.transpose(0, 2, 1)
     return [
         _moved(state, step, more) for state, step, more in zip(states, steps, changes, strict=True)
